@@ -1,0 +1,37 @@
+"""The only file that touches private names of Diffrax and Equinox.
+
+Seen in Diffrax 0.7.2 and Equinox 0.13.8; each name has a test that fails when it moves.
+"""
+
+import jax.tree_util as jtu
+from diffrax import RESULTS
+from diffrax._heuristics import is_sde as is_sde  # which terms are driven by Brownian motion
+from diffrax._saveat import save_y as save_y  # marks "save the state itself" in SubSaveAt.fn
+from diffrax._solution import is_okay as is_okay  # successful or stopped by an event
+from diffrax._solution import update_result as update_result  # first failure wins
+from diffrax._term import WrapTerm
+from jaxtyping import PyTree
+
+from ._custom_types import RealScalarLike
+
+
+def time_direction(terms: PyTree) -> RealScalarLike:
+    """`1` or `-1`: Diffrax integrates `t1 < t0` in negated time and says so only here.
+
+    A solver's `step` sees the negated times; the true time is `t * time_direction(terms)`.
+    Terms that were never wrapped (manual stepping) run in true time.
+    """
+    leaves = jtu.tree_leaves(terms, is_leaf=lambda x: isinstance(x, WrapTerm))
+    for leaf in leaves:
+        if isinstance(leaf, WrapTerm):
+            return leaf.direction
+    return 1
+
+
+def nonlinear_failure() -> RESULTS:
+    """The result code of a constraint that could not be satisfied.
+
+    Result codes cannot be added from outside Diffrax; this is what its implicit solvers
+    return when their equations cannot be solved.
+    """
+    return RESULTS.nonlinear_divergence

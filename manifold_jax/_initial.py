@@ -1,0 +1,159 @@
+"""Where to start: a consistent initial value and a sensible first step."""
+
+import dataclasses
+from typing import Any
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+
+from ._constraint import AbstractConstraint, check_constraint, check_state, constraint_violation
+from ._custom_types import Args, BoolScalar, FloatScalar, IntScalar, RealScalarLike, Y
+from ._projection import NewtonProjection, ProjectionInfo
+
+
+_MESSAGES = (
+    "`constraint` is not finite at the initial time and `y0`. Start from a state at which g(t0, y0, args) "
+    "is defined.",
+    "The Jacobian dg/dy of `constraint` does not have full rank at `y0`: an equation ignores y, depends on the "
+    "others (redundant), or `y0` is a singular point. Remove dependent equations, or start elsewhere.",
+    "`y0` could not be made consistent with `constraint`: no nearby state satisfies g(t0, y, args) = 0. Start "
+    "closer to the manifold, or check that the equations can hold at the same time.",
+    "`y0` is not on the manifold. Write `consistent=\"project\"` to have it moved there, or correct it first with "
+    "`mj.consistent_state`.",
+)
+
+
+def consistent_state(
+    constraint: AbstractConstraint,
+    t: RealScalarLike,
+    y: Y,
+    args: Args = None,
+    *,
+    projection: NewtonProjection | None = None,
+    throw: bool = True,
+) -> tuple[Y, ProjectionInfo]:
+    """Make an initial value consistent: move it onto the manifold, or say why that failed.
+
+    **Arguments:**
+
+    - `constraint`, `t`, `y`, `args`: as for [`project`][].
+    - `projection`: metric and tolerance; its `max_steps` is raised to 50, as a start may be
+        far from the manifold.
+    - `throw`: raise if the state cannot be made consistent. With `throw=False` look at
+        `info.success`; there is then no host callback in the compiled function.
+
+    **Returns:**
+
+    `(y, info)` with `info.correction`, the largest `|change| / (|y| + 1)`. A consistent
+    state is returned unchanged.
+
+    **Raises:**
+
+    A `RuntimeError` (under `jit` too) that says whether the constraint was not finite, its
+    Jacobian rank deficient, or the equations could not be satisfied.
+    """
+    check_state(y, "y0")
+    y = jtu.tree_map(jnp.asarray, y)
+    check_constraint(constraint, t, y, args)
+    projection = NewtonProjection() if projection is None else projection
+    patient = dataclasses.replace(projection, max_steps=max(50, projection.max_steps))
+    consistent, info = patient(constraint, t, y, args)
+    if throw:
+        start = StartInfo(info.correction, info.success, _failure_cause(info))
+        consistent = raise_if_bad_start(consistent, start)
+    return consistent, info
+
+
+class StartInfo(eqx.Module):
+    """How an initial value was treated: the change made, whether it can be used, and if
+    not, which of `_MESSAGES` applies."""
+
+    correction: FloatScalar
+    success: BoolScalar
+    cause: IntScalar
+
+
+def start_state(
+    constraint: AbstractConstraint,
+    t0: RealScalarLike,
+    y0: Y,
+    args: Args,
+    projection: NewtonProjection,
+    consistent: str,
+) -> tuple[Y, StartInfo]:
+    """The state to start from, for `consistent` one of "project", "check" and "assume"."""
+    if consistent == "assume":
+        dtype = jnp.result_type(*jtu.tree_leaves(y0))
+        return y0, StartInfo(jnp.zeros((), dtype), jnp.asarray(True), jnp.asarray(0))
+    moved, info = consistent_state(constraint, t0, y0, args, projection=projection, throw=False)
+    if consistent == "project":
+        return moved, StartInfo(info.correction, info.success, _failure_cause(info))
+    violation = constraint_violation(constraint, t0, y0, args)
+    tolerance = projection.tolerance_for(violation.dtype)
+    satisfied = violation <= tolerance
+    cause = jnp.where(info.success, 3, _failure_cause(info))
+    return y0, StartInfo(jnp.zeros_like(info.correction), satisfied & info.full_rank, cause)
+
+
+def raise_if_bad_start(value: Any, start: StartInfo) -> Any:
+    """Attach the error that names the cause of a failed start to `value`."""
+    return eqx.branched_error_if(value, ~start.success, start.cause, list(_MESSAGES))
+
+
+def _failure_cause(info: ProjectionInfo) -> IntScalar:
+    return jnp.where(jnp.isfinite(info.residual), jnp.where(info.full_rank, 2, 1), 0)
+
+
+def initial_step(
+    terms: Any,
+    solver: dfx.AbstractSolver,
+    t0: RealScalarLike,
+    t1: RealScalarLike,
+    y0: Y,
+    args: Args,
+    controller: dfx.PIDController,
+) -> FloatScalar:
+    """First step of an adaptive solve of an ODE, signed like `t1 - t0`.
+
+    Diffrax has the same estimate but never reaches it and starts with 0.01 whatever the
+    problem. Two evaluations of the vector field bound the first and second derivatives in
+    the controller's norm.
+
+    Source: Hairer, Norsett & Wanner, Solving ODEs I, section II.4 (starting step size).
+    """
+    t0, t1 = jnp.asarray(t0), jnp.asarray(t1)
+    order = solver.error_order(terms)
+    direction = jnp.where(t1 < t0, -1.0, 1.0).astype(t0.dtype)
+    scale = jtu.tree_map(lambda y: controller.atol + controller.rtol * jnp.abs(y), y0)
+
+    def norm(v: Y) -> FloatScalar:
+        return jnp.asarray(controller.norm(jtu.tree_map(lambda a, s: a / s, v, scale)), t0.dtype)
+
+    f0 = terms.vf(t0, y0, args)
+    d0, d1 = norm(y0), norm(f0)
+    small = (d0 < 1e-5) | (d1 < 1e-5)
+    h0 = jnp.where(small, 1e-6, 0.01 * d0 / jnp.where(small, 1.0, d1))
+    step = direction * h0
+    y1 = jtu.tree_map(lambda y, f: y + (step * f).astype(y.dtype), y0, f0)
+    f1 = terms.vf(t0 + step, y1, args)
+    d2 = norm(jtu.tree_map(jnp.subtract, f1, f0)) / h0
+    flat = jnp.maximum(d1, d2) <= 1e-15
+    h1 = jnp.where(
+        flat,
+        jnp.maximum(1e-6, h0 * 1e-3),
+        (0.01 / jnp.where(flat, 1.0, jnp.maximum(d1, d2))) ** (1 / order),
+    )
+    h = jnp.minimum(jnp.minimum(100 * h0, h1), jnp.abs(t1 - t0))
+    # A vector field that is not finite near the start says nothing about the step.
+    h = jnp.where(jnp.isfinite(h) & (h > 0), h, jnp.minimum(0.01, jnp.abs(t1 - t0)))
+    return jax.lax.stop_gradient(direction * h)
+
+
+def controller_tolerances(controller: Any) -> dfx.PIDController | None:
+    """The controller that holds `rtol`, `atol` and `norm`, inside any wrappers around it."""
+    while not hasattr(controller, "rtol") and hasattr(controller, "controller"):
+        controller = controller.controller
+    return controller if hasattr(controller, "rtol") else None

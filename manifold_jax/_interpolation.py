@@ -1,0 +1,89 @@
+"""Dense output: interpolants that end where the corrected steps do, and stay on the manifold."""
+
+from collections.abc import Callable
+from typing import Any
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+
+from ._constraint import AbstractConstraint
+from ._custom_types import Args, RealScalarLike, Y
+from ._projection import NewtonProjection
+
+
+class CorrectedInterpolation(dfx.AbstractLocalInterpolation):
+    """A solver's own interpolant, bent so that it ends at the corrected state:
+    `inner(t) + s^2 (3 - 2 s) (y1 - inner(t1))`, `s` running from 0 to 1 over the step.
+
+    Without this the interpolant would jump at every step by the size of the correction,
+    and the search for the time of an event could find no root.
+    """
+
+    t0: RealScalarLike
+    t1: RealScalarLike
+    inner: dfx.AbstractLocalInterpolation
+    y1: Y
+    correction: Y
+
+    def evaluate(self, t0: RealScalarLike, t1: RealScalarLike | None = None, left: bool = True) -> Y:
+        if t1 is not None:
+            return jtu.tree_map(jnp.subtract, self.evaluate(t1), self.evaluate(t0))
+        value = self.inner.evaluate(t0, left=left)
+        width = self.t1 - self.t0
+        s = (t0 - self.t0) / jnp.where(width == 0, 1, width)
+        blend = s**2 * (3 - 2 * s)
+        bent = jtu.tree_map(lambda v, c: v + (blend * c).astype(v.dtype), value, self.correction)
+        # Exactly the corrected state at the end, not up to rounding; the derivative with
+        # respect to time stays that of the interpolant.
+        at_end = t0 == self.t1
+        rest = jtu.tree_map(lambda y, b: jnp.where(at_end, y - b, 0), self.y1, bent)
+        return jtu.tree_map(jnp.add, bent, jax.lax.stop_gradient(rest))
+
+
+class CorrectedInterpolationFactory(eqx.Module):
+    """Builds [`CorrectedInterpolation`][] from the `dense_info` of a step.
+
+    Diffrax keeps `interpolation_cls` in a static field, so this holds no arrays.
+    """
+
+    inner: Callable[..., dfx.AbstractLocalInterpolation] = eqx.field(static=True)
+
+    def __call__(self, *, t0, t1, corrected, correction, **info) -> CorrectedInterpolation:
+        return CorrectedInterpolation(
+            t0=t0, t1=t1, inner=self.inner(t0=t0, t1=t1, **info), y1=corrected, correction=correction
+        )
+
+
+class ManifoldInterpolation(dfx.AbstractPath):
+    """The dense solution of a solve, every value of it on the manifold.
+
+    Evaluates the piecewise interpolant of the steps and corrects the value. A value that
+    cannot be corrected is NaN.
+    """
+
+    inner: dfx.AbstractPath
+    constraint: AbstractConstraint
+    projection: NewtonProjection
+    args: Args
+
+    @property
+    def t0(self):  # pyright: ignore
+        return self.inner.t0
+
+    @property
+    def t1(self):  # pyright: ignore
+        return self.inner.t1
+
+    def evaluate(self, t0: RealScalarLike, t1: RealScalarLike | None = None, left: bool = True) -> Y:
+        if t1 is not None:
+            return jtu.tree_map(jnp.subtract, self.evaluate(t1, left=left), self.evaluate(t0, left=left))
+        y, info = self.projection(self.constraint, t0, self.inner.evaluate(t0, left=left), self.args)
+        return jtu.tree_map(lambda leaf: jnp.where(info.success, leaf, jnp.nan), y)
+
+    def derivative(self, t: RealScalarLike, left: bool = True) -> Y:
+        t = jnp.asarray(t, dtype=jnp.result_type(float, t))
+        _, out = jax.jvp(lambda t: self.evaluate(t, left=left), (t,), (jnp.ones_like(t),))
+        return out

@@ -1,0 +1,81 @@
+"""Small dense linear systems as arithmetic that XLA can fuse.
+
+A LAPACK or cuSOLVER call per step costs more than a whole Runge-Kutta step of a small
+mechanism and cannot be fused across a batch. Up to `UNROLL_LIMIT` rows the elimination
+is therefore written out entry by entry; beyond that the library routine is used.
+"""
+
+import equinox as eqx
+import jax.numpy as jnp
+import jax.scipy.linalg as jsl
+from jaxtyping import Array, Float
+
+from ._custom_types import BoolScalar
+
+
+# Number of operations grows like m^3 / 3: 170 at m = 8, still less than one library call.
+UNROLL_LIMIT = 8
+
+
+class Factorization(eqx.Module):
+    """`A = L U` of a square matrix, with a flag that says whether its rank was full.
+
+    Without pivoting when unrolled: the matrices met here are `G V` with `V` close to
+    `W^-1 G^T`, hence close to symmetric positive definite.
+    """
+
+    lu: list[list[Float[Array, ""]]] | tuple[Float[Array, "m m"], Array]
+    full_rank: BoolScalar
+
+    def solve(self, b: Float[Array, " m"]) -> Float[Array, " m"]:
+        if not isinstance(self.lu, list):
+            return jsl.lu_solve(self.lu, b)
+        m = len(self.lu)
+        x = [b[i] for i in range(m)]
+        for i in range(m):
+            for k in range(i):
+                x[i] = x[i] - self.lu[i][k] * x[k]
+        for i in reversed(range(m)):
+            for k in range(i + 1, m):
+                x[i] = x[i] - self.lu[i][k] * x[k]
+            x[i] = x[i] / self.lu[i][i]
+        return jnp.stack(x)
+
+
+def factorize(A: Float[Array, "m m"]) -> Factorization:
+    """Factor `A`.
+
+    The rank counts as full when every pivot exceeds `10 m eps` times its diagonal entry:
+    for a Gram matrix `A = G W^-1 G^T` that ratio is the squared sine of the angle between
+    one row of `G` and the span of those before it, and rounding leaves about `eps` of it.
+    """
+    m = A.shape[0]
+    threshold = 10 * m * jnp.finfo(A.dtype).eps
+    if m > UNROLL_LIMIT:
+        size = jnp.sqrt(jnp.maximum(jnp.abs(jnp.diagonal(A)), jnp.finfo(A.dtype).tiny))
+        equilibrated, _ = jsl.lu_factor(A / size[:, None] / size[None, :])
+        pivots = jnp.abs(jnp.diagonal(equilibrated))
+        return Factorization(jsl.lu_factor(A), jnp.all(pivots > threshold))
+    lu = [[A[i, j] for j in range(m)] for i in range(m)]
+    full_rank = jnp.asarray(True)
+    for k in range(m):
+        full_rank &= lu[k][k] > threshold * jnp.abs(A[k, k])
+        for i in range(k + 1, m):
+            lu[i][k] = lu[i][k] / lu[k][k]
+            for j in range(k + 1, m):
+                lu[i][j] = lu[i][j] - lu[i][k] * lu[k][j]
+    return Factorization(lu, full_rank)
+
+
+def matmul(A: Float[Array, "i k"], B: Float[Array, "k j"]) -> Float[Array, "i j"]:
+    """`A @ B`; small products as a sum that fuses, as batched tiny `dot`s are slow."""
+    if A.shape[0] * B.shape[1] > UNROLL_LIMIT**2:
+        return A @ B
+    return jnp.sum(A[:, :, None] * B[None, :, :], axis=1)
+
+
+def matvec(A: Float[Array, "i k"], x: Float[Array, " k"]) -> Float[Array, " i"]:
+    """`A @ x`, small products as a sum that fuses."""
+    if min(A.shape) > UNROLL_LIMIT:
+        return A @ x
+    return jnp.sum(A * x[None, :], axis=1)

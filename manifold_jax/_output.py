@@ -1,0 +1,124 @@
+"""Everything handed out between steps: saved values, user functions and events, on the manifold."""
+
+from collections.abc import Callable
+from typing import Any
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jaxtyping import Array
+
+from ._compat import save_y
+from ._custom_types import Args, BoolScalar, RealScalarLike, Y
+from ._solver.base import AbstractManifoldSolver
+
+
+def _is_sub(x: Any) -> bool:
+    return isinstance(x, dfx.SubSaveAt)
+
+
+def _is_interpolated(sub: dfx.SubSaveAt, event: dfx.Event | None) -> bool:
+    """Steps end on the manifold; interpolated values, also those at an event, do not."""
+    return sub.ts is not None or event is not None
+
+
+def on_manifold_saving(
+    saveat: dfx.SaveAt, solver: AbstractManifoldSolver, event: dfx.Event | None
+) -> dfx.SaveAt:
+    """What Diffrax is asked to save.
+
+    The state itself is corrected after the solve, all values at once, which is several times
+    cheaper than one by one; only a user's function has to see corrected states on the way.
+    The solver's state is always kept, for the statistics in it.
+    """
+
+    def wrap(sub: dfx.SubSaveAt) -> dfx.SubSaveAt:
+        if sub.fn is save_y or not _is_interpolated(sub, event):
+            return sub
+
+        def fn(t, y, args):
+            corrected, info = solver.projection(solver.constraint, t, y, args)
+            return sub.fn(t, _nan_unless(info.success, corrected), args)
+
+        return eqx.tree_at(lambda s: s.fn, sub, fn)
+
+    subs = jtu.tree_map(wrap, saveat.subs, is_leaf=_is_sub)
+    return eqx.tree_at(
+        lambda s: (s.subs, s.solver_state), saveat, (subs, True), is_leaf=lambda x: x is None
+    )
+
+
+def on_manifold_events(
+    event: dfx.Event | None,
+    solver: AbstractManifoldSolver,
+    terms: Any,
+    t0: Any,
+    t1: Any,
+    dt0: Any,
+) -> dfx.Event | None:
+    """Events that see corrected states and the true time.
+
+    Diffrax hands an event function negated times when integrating backwards; with the
+    original terms and times it is consistent again.
+    """
+    if event is None:
+        return None
+    direction = jnp.where(t0 < t1, 1, -1)
+
+    def wrap(cond_fn: Callable) -> Callable:
+        def on_manifold(t, y, args, **kwargs):
+            t = t * direction
+            y, _ = solver.projection(solver.constraint, t, y, args)
+            kwargs = {**kwargs, "terms": terms, "t0": t0, "t1": t1, "dt0": dt0}
+            return cond_fn(t, y, args, **kwargs)
+
+        return on_manifold
+
+    cond_fn = jtu.tree_map(wrap, event.cond_fn, is_leaf=callable)
+    return dfx.Event(cond_fn, event.root_finder, event.direction)
+
+
+def project_output(
+    saveat: dfx.SaveAt,
+    event: dfx.Event | None,
+    solver: AbstractManifoldSolver,
+    ts: Any,
+    ys: Any,
+    y0: Y,
+    args: Args,
+) -> tuple[Any, BoolScalar]:
+    """The saved values, corrected; and whether any of them could not be."""
+    failed = jnp.asarray(False)
+
+    def correct(sub: dfx.SubSaveAt, ts: Array, ys: Any) -> Any:
+        nonlocal failed
+        if sub.fn is not save_y or not _is_interpolated(sub, event):
+            return ys
+        # Entries that were not reached hold infinity. They are replaced before the
+        # projection, not after it, as the derivative of a NaN is never zero.
+        used = jnp.isfinite(ts)
+        ts = jnp.where(used, ts, ts[0])
+        padded = jax.vmap(lambda u, y: _select(u, y, y0))(used, ys)
+        out, success = jax.vmap(lambda t, y: _corrected(solver, t, y, args))(ts, padded)
+        failed |= jnp.any(used & ~success)
+        return jax.vmap(_select)(used, out, ys)
+
+    ys = jtu.tree_map(correct, saveat.subs, ts, ys, is_leaf=_is_sub)
+    return ys, failed
+
+
+def _corrected(
+    solver: AbstractManifoldSolver, t: RealScalarLike, y: Y, args: Args
+) -> tuple[Y, BoolScalar]:
+    corrected, info = solver.projection(solver.constraint, t, y, args)
+    return _nan_unless(info.success, corrected), info.success
+
+
+def _select(pred: BoolScalar, a: Y, b: Y) -> Y:
+    return jtu.tree_map(lambda u, v: jnp.where(pred, u, v), a, b)
+
+
+def _nan_unless(success: BoolScalar, y: Y) -> Y:
+    return jtu.tree_map(lambda leaf: jnp.where(success, leaf, jnp.nan), y)

@@ -1,0 +1,1 @@
+from .projected import Projected as Projected

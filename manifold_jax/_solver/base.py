@@ -1,0 +1,121 @@
+"""What every step hook shares: forwarding to the solver it is wrapped around."""
+
+from typing import Any
+
+import diffrax as dfx
+import equinox as eqx
+
+from .._compat import is_sde
+from .._constraint import AbstractConstraint
+from .._custom_types import Args, RealScalarLike, Y
+
+
+# One-step methods that keep no past values of y. Others (leapfrog, reversible) carry a
+# shadow trajectory in their state that would not be moved onto the manifold.
+_SUPPORTED = (
+    dfx.AbstractRungeKutta,
+    dfx.AbstractSRK,
+    dfx.Euler,
+    dfx.ImplicitEuler,
+    dfx.EulerHeun,
+    dfx.StratonovichMilstein,
+)
+
+
+class AbstractManifoldSolver(dfx.AbstractWrappedSolver):
+    """A Diffrax solver wrapped around another, `inner`, that keeps to a manifold.
+
+    Diffrax looks at the type and at some attributes of the solver it is given. It sends
+    type checks through `.solver`, one level only, so `solver` is the innermost solver;
+    everything else is forwarded here, in one place. Implementations provide `init`,
+    `step` and `interpolation_cls`.
+    """
+
+    inner: eqx.AbstractVar[dfx.AbstractSolver]
+    constraint: eqx.AbstractVar[AbstractConstraint]
+
+    @property
+    def solver(self) -> dfx.AbstractSolver:
+        return self.inner.solver if isinstance(self.inner, dfx.HalfSolver) else self.inner
+
+    @property
+    def term_structure(self):  # pyright: ignore
+        return self.inner.term_structure
+
+    @property
+    def term_compatible_contr_kwargs(self):  # pyright: ignore
+        return self.inner.term_compatible_contr_kwargs
+
+    # Read, and replaced through `eqx.tree_at`, when the innermost solver is implicit.
+    @property
+    def root_finder(self):
+        return self.solver.root_finder
+
+    @property
+    def root_find_max_steps(self):
+        return self.solver.root_find_max_steps
+
+    # Set by forward-mode adjoints on Runge-Kutta methods.
+    @property
+    def scan_kind(self):
+        return self.solver.scan_kind
+
+    def order(self, terms) -> int | None:
+        return self.inner.order(terms)
+
+    def strong_order(self, terms) -> RealScalarLike | None:
+        return self.inner.strong_order(terms)
+
+    def error_order(self, terms) -> RealScalarLike | None:
+        return self.inner.error_order(terms)
+
+    def func(self, terms, t0: RealScalarLike, y0: Y, args: Args) -> Any:
+        return self.inner.func(terms, t0, y0, args)
+
+
+def check_inner_solver(solver: Any, hook: str) -> None:
+    """Refuse solvers whose steps cannot be corrected, naming what to write instead."""
+    if isinstance(solver, type):
+        raise TypeError(f"`solver` must be an instance: write `{hook}({solver.__name__}(), ...)`.")
+    if not isinstance(solver, dfx.AbstractSolver):
+        raise TypeError(f"`solver` must be a Diffrax solver, got {type(solver).__name__}.")
+    if isinstance(solver, AbstractManifoldSolver):
+        raise ValueError(
+            f"`solver` is already a {type(solver).__name__}. Put all equations into one constraint: "
+            f"`{hook}(solver, constraint)`."
+        )
+    if isinstance(solver, dfx.HalfSolver):
+        if isinstance(solver.solver, AbstractManifoldSolver):
+            raise ValueError(
+                f"`HalfSolver({type(solver.solver).__name__}(...))` hides failed steps: put the hook outermost, "
+                f"`{hook}(HalfSolver(solver), constraint)`."
+            )
+        if isinstance(solver.solver, dfx.AbstractImplicitSolver):
+            raise ValueError(
+                f"`HalfSolver({type(solver.solver).__name__}())` does not work in Diffrax: it loses failures of the "
+                "implicit stages. Use the implicit solver itself, it has an error estimate: "
+                f"`{hook}({type(solver.solver).__name__}(), constraint)`."
+            )
+        solver = solver.solver
+    name = type(solver).__name__
+    if isinstance(solver, dfx.ItoMilstein):
+        raise ValueError(
+            "`solver=ItoMilstein()` cannot be projected: projection turns an Ito method into a Stratonovich one. "
+            "Write the equation in Stratonovich form and use `StratonovichMilstein()`."
+        )
+    if not isinstance(solver, _SUPPORTED):
+        raise ValueError(
+            f"`solver={name}()` keeps past values of y in its state (or splits y), which a correction onto the "
+            "manifold does not reach. Use a Runge-Kutta method such as `Tsit5()`, `Dopri8()` or `Kvaerno5()`, or for "
+            "Stratonovich equations `Heun()` or `StratonovichMilstein()`."
+        )
+
+
+def check_noise(solver: dfx.AbstractSolver, terms: Any) -> None:
+    """Refuse Ito solvers of stochastic equations (`Euler` is one, but fine for ODEs)."""
+    if is_sde(terms) and isinstance(solver, dfx.AbstractItoSolver):
+        raise ValueError(
+            f"`solver={type(solver).__name__}()` converges to the Ito solution, but projection makes it converge to "
+            "the Stratonovich one. Write the equation in Stratonovich form and use `EulerHeun()`, `Heun()` or "
+            "`StratonovichMilstein()`."
+        )

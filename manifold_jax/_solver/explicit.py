@@ -1,0 +1,84 @@
+"""One explicit Runge-Kutta step, written out stage by stage.
+
+Diffrax runs the stages in a loop with dynamic buffers. Writing them out lets XLA fuse a
+whole step of a small system, and lets the new state be corrected *before* the last stage
+is evaluated there, so that the derivative that a first-same-as-last method carries over
+belongs to the corrected state at no cost.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import diffrax as dfx
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from diffrax import AbstractTerm
+
+from .._custom_types import Args, RealScalarLike, Y
+
+
+def is_unrollable(solver: dfx.AbstractSolver, terms: Any, t0, t1, y0: Y, args: Args) -> bool:
+    """Explicit, one tableau, and a vector field that may be evaluated on its own."""
+    return (
+        isinstance(solver, dfx.AbstractERK)
+        and isinstance(solver.tableau, dfx.ButcherTableau)
+        and not terms.is_vf_expensive(t0, t1, y0, args)
+    )
+
+
+def is_first_same_as_last(tableau: dfx.ButcherTableau) -> bool:
+    return tableau.fsal and tableau.ssal
+
+
+def explicit_step(
+    tableau: dfx.ButcherTableau,
+    terms: AbstractTerm,
+    t0: RealScalarLike,
+    t1: RealScalarLike,
+    y0: Y,
+    args: Args,
+    f0: Any,
+    correct: Callable[[Y], tuple[Y, Any]],
+) -> tuple[Y, Y, Y, dict[str, Any], Any, Any]:
+    """Step from `y0`, with `f0` the vector field there, and correct the result.
+
+    **Returns:**
+
+    The corrected state, the uncorrected one, the embedded error estimate, the data of the
+    solver's own interpolation, the vector field of the last stage, and what `correct`
+    returned besides the state.
+    """
+    control = terms.contr(t0, t1)
+    last = len(tableau.a_lower) - 1
+    f, increments = f0, [terms.prod(f0, control)]
+    fsal = is_first_same_as_last(tableau)
+    y = y0
+    for i, (row, c) in enumerate(zip(tableau.a_lower, tableau.c)):
+        y = _combine(row, increments, y0)
+        if fsal and i == last:
+            raw, (y, info) = y, correct(y)
+        # The last node of most methods is exactly 1; `t0 + 1 (t1 - t0)` may not be `t1`.
+        t = t1 if c == 1 else t0 + float(c) * (t1 - t0)
+        f = terms.vf(t, y, args)
+        increments.append(terms.prod(f, control))
+    if not fsal:
+        raw = _combine(tableau.b_sol, increments, y0)
+        y, info = correct(raw)
+    error = _combine(tableau.b_error, increments)
+    k = jtu.tree_map(lambda *ks: jnp.stack(ks), *increments)
+    return y, raw, error, dict(y0=y0, y1=raw, k=k), f, info
+
+
+def _combine(weights: Any, increments: list[Y], start: Y | None = None) -> Y:
+    """`start + sum_i weights_i increments_i`, without the terms whose weight is zero."""
+    used = [(float(w), k) for w, k in zip(weights, increments) if w != 0]
+    total = jtu.tree_map(lambda *ks: sum(w * k for (w, _), k in zip(used, ks)), *(k for _, k in used))
+    return total if start is None else jtu.tree_map(jnp.add, start, total)
+
+
+def refreshed(made_jump: Any, f0: Any, evaluate: Callable[[], Any]) -> Any:
+    """The carried derivative, evaluated anew after a jump of the vector field."""
+    if made_jump is False:
+        return f0
+    return jax.lax.cond(made_jump, evaluate, lambda: f0)

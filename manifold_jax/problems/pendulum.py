@@ -1,0 +1,173 @@
+"""The planar pendulum in Cartesian coordinates."""
+
+from typing import Any, NamedTuple, TypeAlias
+
+import diffrax
+import jax.numpy as jnp
+import numpy as np
+import scipy.special
+from jax.core import Tracer
+from jaxtyping import Array, Float
+
+from .._constraint import Constraint
+from .._custom_types import FloatScalar, RealScalarLike
+from ._problem import as_floating, Problem
+
+
+State: TypeAlias = tuple[Float[Array, "2"], Float[Array, "2"]]
+
+# Coordinates of benchmark A01 at t = 0, 0.5, ..., 10: released at rest from (-1, 0) with
+# g = 9.81, m = L = 1. All 6 printed digits are right. Source: IFToMM Technical Committee
+# for Multibody Dynamics, Library of Computational Benchmark Problems, A01 (simple pendulum).
+A01_X = (
+    -1.0, -0.391049, 0.986292, 0.884132, -0.793566, -0.996334, 0.176652,
+    0.999914, 0.577564, -0.963293, -0.942305, 0.665293, 0.999498, 0.0511945,
+    -0.998619, -0.727459, 0.919858, 0.975626, -0.498374, -0.999992, -0.275087,
+)  # fmt: skip
+A01_Y = (
+    0.0, -0.92037, -0.165011, -0.467237, -0.608484, -0.0855439, -0.984273,
+    -0.013142, -0.816346, -0.268452, -0.334754, -0.746583, -0.0316965, -0.998689,
+    -0.0525408, -0.686151, -0.392252, -0.21944, -0.866962, -0.00402112, -0.961419,
+)  # fmt: skip
+
+
+class PendulumArgs(NamedTuple):
+    """Parameters of `pendulum`: gravity (m/s^2), length (m), mass (kg)."""
+
+    gravity: Any = 9.81
+    length: Any = 1.0
+    mass: Any = 1.0
+
+
+def _field(t: RealScalarLike, y: State, args: PendulumArgs) -> State:
+    del t
+    q, v = y
+    force = jnp.stack([jnp.zeros_like(args.mass), -args.mass * args.gravity])
+    free = force / args.mass
+    # a = force / m - mu q, with mu such that the constraint holds for the accelerations:
+    # q.a + v.v = 0.
+    mu = (jnp.sum(q * free) + jnp.sum(v * v)) / jnp.sum(q * q)
+    return v, free - mu * q
+
+
+def _residual(t: RealScalarLike, y: State, args: PendulumArgs) -> tuple[FloatScalar, FloatScalar]:
+    del t
+    q, v = y
+    return jnp.sum(q * q) - args.length**2, jnp.sum(q * v)
+
+
+def _initial_state(args: PendulumArgs, start: State) -> State:
+    q, v = start
+    return q * (args.length / jnp.sqrt(jnp.sum(q * q))), v
+
+
+def _make_constraint(args: PendulumArgs, y0: State) -> Constraint:
+    del args, y0
+    return Constraint(_residual)
+
+
+def _exact(t: np.ndarray, args: PendulumArgs, y0: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Jacobi elliptic functions; `theta` is measured from the downward vertical."""
+    (x, y), (vx, vy) = y0
+    L = float(args.length)
+    frequency = np.sqrt(float(args.gravity) / L)
+    theta = np.arctan2(x, -y)
+    rate = (vx * np.cos(theta) + vy * np.sin(theta)) / L
+    # k^2 = (energy above the lowest point) / (2 m g L), at least 1 if it goes over the top
+    k2 = (rate / (2 * frequency)) ** 2 + np.sin(theta / 2) ** 2
+    k = np.sqrt(k2)
+    if k2 < 1:
+        # sin(theta / 2) = k sn, theta' = 2 frequency k cn. The phase through atan2 of both:
+        # asin alone would lose half the digits at the turning points.
+        phase = np.arctan2(2 * frequency * np.sin(theta / 2), rate)
+        u = scipy.special.ellipkinc(phase, k2) + frequency * t
+        sn, cn, dn, _ = scipy.special.ellipj(u, k2)
+        sin_half, cos_half, rate = k * sn, dn, 2 * frequency * k * cn
+    else:
+        # theta / 2 = +-am
+        sense = np.copysign(1.0, rate)
+        u = scipy.special.ellipkinc(sense * theta / 2, 1 / k2) + frequency * k * t
+        if not np.all(np.isfinite(u)):  # at rest in the upper equilibrium
+            return np.broadcast_to(y0[0], (t.size, 2)), np.zeros((t.size, 2))
+        sn, cn, dn, _ = scipy.special.ellipj(u, 1 / k2)
+        sin_half, cos_half, rate = sense * sn, cn, sense * 2 * frequency * k * dn
+    sin, cos = 2 * sin_half * cos_half, 1 - 2 * sin_half**2
+    q = L * np.stack([sin, -cos], axis=-1)
+    v = L * np.stack([rate * cos, rate * sin], axis=-1)
+    return q, v
+
+
+def pendulum(
+    *,
+    gravity: Any = 9.81,
+    length: Any = 1.0,
+    mass: Any = 1.0,
+    q0: Any = None,
+    v0: Any = (0.0, 0.0),
+    t1: float = 10.0,
+) -> Problem:
+    r"""The planar pendulum in Cartesian coordinates, $q = (x, y)$ with $y$ upwards:
+
+    $$m q'' = (0, -m g) - 2 \lambda q, \quad |q|^2 = L^2, \quad q \cdot q' = 0.$$
+
+    The state is `(q, v)`, each of shape `(2,)`; two constraints, position and velocity.
+    The accelerations are written out, $q'' = (0, -g) - \mu q$ with
+    $\mu = (v \cdot v - g y) / |q|^2$; mass and length do not enter them.
+
+    Exact solution by Jacobi elliptic functions from every initial state (swinging or going
+    over the top), to about `1e-15 (1 + sqrt(g/L) t)` away from the separatrix.
+
+    **Arguments:**
+
+    - `gravity` (m/s^2), `length` (m), `mass` (kg): scalars, `args`.
+    - `q0`: initial position (m), shape `(2,)`, by default `(length, 0)`. `with_args` moves
+        it along its ray to the new length and keeps the velocity.
+    - `v0`: initial velocity (m/s), shape `(2,)`, perpendicular to `q0`.
+    - `t1`: the end of the time span (s).
+
+    Two published cases:
+
+    - IFToMM benchmark A01: `pendulum(q0=(-1.0, 0.0))`; its curve, 6 digits, is in this
+        module (`from manifold_jax.problems.pendulum import A01_X, A01_Y`). The text of the
+        benchmark starts at `x = +1` in one place, its data at `x = -1`: mirror images.
+    - IVP test set: `pendulum(gravity=1.0, v0=(0.0, 1.0), t1=1.0)`. Of the 18 printed
+        digits of the end values only 11 are right (`reference` is). Its multiplier is
+        twice the one of `phi = |q|^2 - L^2`.
+
+    A known trap: the gravity with which a pendulum released from the horizontal returns
+    after 2 s is `4 K(1/2)^2 = 13.750371636040745`; the value 13.7503716373294544 that is
+    often printed is off by 9.4e-11.
+
+    Sources: IFToMM Technical Committee for Multibody Dynamics, Library of Computational
+    Benchmark Problems, A01; Mazzia & Magherini, Test Set for IVP Solvers.
+    """
+    length = as_floating(length)
+    q0 = jnp.stack([length, jnp.zeros_like(length)]) if q0 is None else as_floating(q0)
+    v0 = as_floating(v0)
+    _check_start(q0, v0, length)
+    return Problem(
+        "pendulum",
+        diffrax.ODETerm(_field),
+        t1=t1,
+        args=PendulumArgs(gravity, length, mass),
+        start=(q0, v0),
+        initial_state=_initial_state,
+        make_constraint=_make_constraint,
+        exact=_exact,
+    )
+
+
+def _check_start(q0: Array, v0: Array, length: Array) -> None:
+    if q0.shape != (2,) or v0.shape != (2,):
+        raise ValueError(f"`q0` and `v0` must have shape (2,), got {q0.shape} and {v0.shape}.")
+    if any(isinstance(x, Tracer) for x in (q0, v0, length)):
+        return
+    remedy = "For a start off the manifold use `pendulum().with_initial((q0, v0))`."
+    distance, speed = np.hypot(*q0), np.hypot(*v0)
+    # loose enough for data in single precision
+    if not np.isclose(distance, length, rtol=1e-5):
+        raise ValueError(
+            f"`q0` must have the length {length} of the pendulum, not {distance}. {remedy}"
+        )
+    if abs(np.dot(q0, v0)) > 1e-5 * distance * speed:
+        raise ValueError(f"`v0` must be perpendicular to `q0`, got {v0} and {q0}. {remedy}")
