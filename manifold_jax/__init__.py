@@ -2,6 +2,7 @@
 
 from importlib.metadata import version
 
+from . import problems as problems
 from ._constraint import (
     Constraint as Constraint,
     constraint_violation as constraint_violation,

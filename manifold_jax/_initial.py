@@ -60,7 +60,7 @@ def consistent_state(
     check_constraint(constraint, t, y, args)
     projection = NewtonProjection() if projection is None else projection
     patient = dataclasses.replace(projection, max_steps=max(50, projection.max_steps))
-    consistent, info = patient(constraint, t, y, args)
+    consistent, info = patient(constraint, t, y, args, far=True)
     if throw:
         start = StartInfo(info.correction, info.success, _failure_cause(info))
         consistent = raise_if_bad_start(consistent, start)

@@ -67,15 +67,15 @@ def factorize(A: Float[Array, "m m"]) -> Factorization:
     return Factorization(lu, full_rank)
 
 
-def matmul(A: Float[Array, "i k"], B: Float[Array, "k j"]) -> Float[Array, "i j"]:
-    """`A @ B`; small products as a sum that fuses, as batched tiny `dot`s are slow."""
-    if A.shape[0] * B.shape[1] > UNROLL_LIMIT**2:
-        return A @ B
-    return jnp.sum(A[:, :, None] * B[None, :, :], axis=1)
+def gram(A: Float[Array, "i n"], B: Float[Array, "k n"]) -> Float[Array, "i k"]:
+    """`A B^T`; small ones as a sum that fuses, as batched tiny `dot`s are slow."""
+    if max(A.shape[0], B.shape[0]) > UNROLL_LIMIT:
+        return A @ B.T
+    return jnp.sum(A[:, None, :] * B[None, :, :], axis=2)
 
 
-def matvec(A: Float[Array, "i k"], x: Float[Array, " k"]) -> Float[Array, " i"]:
-    """`A @ x`, small products as a sum that fuses."""
-    if min(A.shape) > UNROLL_LIMIT:
-        return A @ x
-    return jnp.sum(A * x[None, :], axis=1)
+def combine(weights: Float[Array, " m"], rows: Float[Array, "m n"]) -> Float[Array, " n"]:
+    """`sum_i weights_i rows_i`."""
+    if rows.shape[0] > UNROLL_LIMIT:
+        return weights @ rows
+    return sum(weights[i] * rows[i] for i in range(rows.shape[0]))

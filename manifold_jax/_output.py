@@ -96,28 +96,29 @@ def project_output(
         nonlocal failed
         if sub.fn is not save_y or not _is_interpolated(sub, event):
             return ys
-        # Entries that were not reached hold infinity. They are replaced before the
-        # projection, not after it, as the derivative of a NaN is never zero.
-        used = jnp.isfinite(ts)
-        ts = jnp.where(used, ts, ts[0])
-        padded = jax.vmap(lambda u, y: _select(u, y, y0))(used, ys)
-        out, success = jax.vmap(lambda t, y: _corrected(solver, t, y, args))(ts, padded)
-        failed |= jnp.any(used & ~success)
-        return jax.vmap(_select)(used, out, ys)
+        out, failures = jax.vmap(lambda t, y: _corrected(solver, t, y, y0, args))(ts, ys)
+        failed |= jnp.any(failures)
+        return out
 
     ys = jtu.tree_map(correct, saveat.subs, ts, ys, is_leaf=_is_sub)
     return ys, failed
 
 
 def _corrected(
-    solver: AbstractManifoldSolver, t: RealScalarLike, y: Y, args: Args
+    solver: AbstractManifoldSolver, t: Array, y: Y, y0: Y, args: Args
 ) -> tuple[Y, BoolScalar]:
-    corrected, info = solver.projection(solver.constraint, t, y, args)
-    return _nan_unless(info.success, corrected), info.success
+    """One saved value, corrected, and whether that failed.
 
-
-def _select(pred: BoolScalar, a: Y, b: Y) -> Y:
-    return jtu.tree_map(lambda u, v: jnp.where(pred, u, v), a, b)
+    Entries that were not reached hold infinity and stay so. They are replaced before the
+    projection, not after it, as the derivative of a NaN is never zero.
+    """
+    used = jnp.isfinite(t)
+    y = jtu.tree_map(lambda a, b: jnp.where(used, a, b), y, y0)
+    corrected, info = solver.projection(solver.constraint, jnp.where(used, t, jnp.zeros_like(t)), y, args)
+    missing = jnp.where(used, jnp.nan, jnp.inf)
+    valid = used & info.success
+    out = jtu.tree_map(lambda a: jnp.where(valid, a, missing.astype(a.dtype)), corrected)
+    return out, used & ~info.success
 
 
 def _nan_unless(success: BoolScalar, y: Y) -> Y:

@@ -25,7 +25,7 @@ from ._constraint import (
     row_scale,
 )
 from ._custom_types import Args, BoolScalar, FloatScalar, IntScalar, RealScalarLike, Y
-from ._linear import factorize, matmul, matvec
+from ._linear import combine, Factorization, factorize, gram
 
 
 class ProjectionInfo(eqx.Module):
@@ -50,11 +50,9 @@ class ProjectionInfo(eqx.Module):
 class NewtonProjection(eqx.Module):
     """Projects by a simplified Newton iteration on the `m` multipliers.
 
-    Solves `g(t, y + V z, args) = 0` for `z`, `V = W^-1 G(y)^T`. The Jacobian and one
-    factorization at `y` serve the first two iterations; a point that needs more gets a
-    fresh Jacobian each time, and shorter steps while the residual does not decrease.
-    Iterates until the residual is at the level of its own rounding errors or stops
-    decreasing, and reports failure if the scaled residual `max_i |g_i| / scale_i`,
+    Solves `g(t, y + V z, args) = 0` for `z`, `V = W^-1 G(y)^T`, with one Jacobian and one
+    factorization. Iterates until the residual is at the level of its own rounding errors or
+    stops decreasing, and reports failure if the scaled residual `max_i |g_i| / scale_i`,
     `scale_i = max_j |G_ij| (|y_j| + 1)`, is then still above `tolerance`.
 
     The derivative is that of the implicit function, exact in forward and reverse mode and
@@ -80,7 +78,7 @@ class NewtonProjection(eqx.Module):
     """
 
     metric: Literal["identity", "error"] | Any = "identity"
-    max_steps: int = eqx.field(static=True, default=10)
+    max_steps: int = eqx.field(static=True, default=20)
     tolerance: float | None = None
     rtol: RealScalarLike | None = None
     atol: RealScalarLike | None = None
@@ -101,11 +99,14 @@ class NewtonProjection(eqx.Module):
         args: Args = None,
         *,
         fallback: Y | None = None,
+        far: bool = False,
     ) -> tuple[Y, ProjectionInfo]:
         """Correct one point; see [`project`][] for arguments and return values.
 
         `fallback` is a state at which `g` is finite; the derivative of a failed projection
-        is taken there, so that the zero cotangent of a rejected step stays zero.
+        is taken there, so that the zero cotangent of a rejected step stays zero. `far`
+        is for points that are not the result of a small step: every iteration gets a new
+        Jacobian, and shorter steps while the residual does not decrease.
         """
         x, unravel = jfu.ravel_pytree(y)
         safe = x if fallback is None else jfu.ravel_pytree(fallback)[0]
@@ -119,7 +120,7 @@ class NewtonProjection(eqx.Module):
         inverse_metric = self._inverse_metric(y, x)
         problem = _Problem(residual, t, x, args, inverse_metric)
         tolerance = self.tolerance_for(x.dtype)
-        root = _solve(problem, jax.lax.stop_gradient(safe), self.max_steps, tolerance)
+        root = _solve(problem, jax.lax.stop_gradient(safe), self.max_steps, tolerance, far)
         correction = jax.lax.stop_gradient(jnp.max(jnp.abs(root.p - x) / (jnp.abs(x) + 1)))
         info = ProjectionInfo(
             -root.z, root.iterations, root.residual, correction, root.full_rank, root.success
@@ -162,9 +163,9 @@ class _Problem(NamedTuple):
     def g(self, x: Float[Array, " n"]) -> Float[Array, " m"]:
         return self.residual(self.t, x, self.args)
 
-    def along(self, G: Float[Array, "m n"]) -> Float[Array, "n m"]:
-        """`W^-1 G^T`."""
-        return G.T if self.inverse_metric is None else self.inverse_metric[:, None] * G.T
+    def weighted(self, G: Float[Array, "m n"]) -> Float[Array, "m n"]:
+        """`V^T = G W^-1`, the directions as rows."""
+        return G if self.inverse_metric is None else G * self.inverse_metric[None, :]
 
     def displaced(self, z: Float[Array, " m"]) -> Float[Array, " n"]:
         """`x + V z` without forming `V`."""
@@ -186,54 +187,94 @@ class _Iterate(NamedTuple):
     z: Float[Array, " m"]
     r: Float[Array, " m"]
     level: FloatScalar  # max_i |r_i| / scale_i
-    damping: FloatScalar  # fraction of the Newton step tried next
     iterations: IntScalar
-    finished: BoolScalar
+    progress: BoolScalar  # whether the last iteration lowered the residual
+
+
+class _Equations(NamedTuple):
+    """The `m` equations `g(t, x + V z, args) = 0` in the multipliers `z`."""
+
+    problem: _Problem
+    directions: Float[Array, "m n"]
+    scale: Float[Array, " m"]
+
+    def point(self, z: Float[Array, " m"]) -> Float[Array, " n"]:
+        return self.problem.x + combine(z, self.directions)
+
+    def at(self, z: Float[Array, " m"]) -> tuple[Float[Array, " m"], FloatScalar]:
+        r = self.problem.g(self.point(z))
+        return r, self.level(r)
+
+    def level(self, r: Float[Array, " m"]) -> FloatScalar:
+        return jnp.max(jnp.abs(r) / self.scale)
+
+    def lowered(self, state: _Iterate, dz: Float[Array, " m"]) -> _Iterate:
+        """The step `z - dz` if it lowers the residual, else the state as it was."""
+        z = state.z - dz
+        r, level = self.at(z)
+        progress = level < state.level
+        kept = jtu.tree_map(
+            lambda new, old: jnp.where(progress, new, old), (z, r, level), state[:3]
+        )
+        return _Iterate(*kept, state.iterations + 1, progress)
+
+
+def _chord(
+    equations: _Equations, r: Float[Array, " m"], factorization: Factorization, max_steps: int
+) -> _Iterate:
+    """Simplified Newton: one factorization throughout. Two iterations are nearly always
+    enough, and are written out so that they fuse with the step around them."""
+    z = jnp.zeros_like(r)
+    for _ in range(min(2, max_steps)):
+        z = z - factorization.solve(r)
+        r, level = equations.at(z)
+    rounding = 4 * jnp.finfo(r.dtype).eps
+    return jax.lax.while_loop(
+        lambda s: (s.level > rounding) & s.progress & (s.iterations < max_steps),
+        lambda s: equations.lowered(s, factorization.solve(s.r)),
+        _Iterate(z, r, level, jnp.asarray(min(2, max_steps), jnp.int32), jnp.asarray(True)),
+    )
+
+
+def _damped_newton(
+    equations: _Equations, r: Float[Array, " m"], max_steps: int, tolerance: Any
+) -> _Iterate:
+    """A new Jacobian in every iteration, and a quarter of the step while the residual grows."""
+
+    def unfinished(carry: tuple[_Iterate, FloatScalar]) -> BoolScalar:
+        s, _ = carry
+        stalled = ~s.progress & (s.level <= tolerance)
+        rounding = 4 * jnp.finfo(r.dtype).eps
+        return (s.level > rounding) & ~stalled & (s.iterations < max_steps)
+
+    def advance(carry: tuple[_Iterate, FloatScalar]) -> tuple[_Iterate, FloatScalar]:
+        s, damping = carry
+        _, G = jacobian(equations.problem.g, equations.point(s.z))
+        dz = factorize(gram(G, equations.directions)).solve(s.r)
+        s = equations.lowered(s, damping * dz)
+        return s, jnp.where(s.progress, jnp.ones_like(damping), damping / 4)
+
+    level = equations.level(r)
+    start = _Iterate(jnp.zeros_like(r), r, level, jnp.zeros((), jnp.int32), jnp.asarray(True))
+    return jax.lax.while_loop(unfinished, advance, (start, jnp.ones_like(level)))[0]
 
 
 @eqx.filter_custom_jvp
-def _solve(problem: _Problem, safe: Float[Array, " n"], max_steps: int, tolerance: Any) -> _Root:
+def _solve(
+    problem: _Problem, safe: Float[Array, " n"], max_steps: int, tolerance: Any, far: bool
+) -> _Root:
     del safe
-    x, eps = problem.x, jnp.finfo(problem.x.dtype).eps
-    r, G = jacobian(problem.g, x)
-    V = problem.along(G)
-    factorization = factorize(matmul(G, V))
-    scale = row_scale(G, x)
-    rounding = 2 * eps * matvec(jnp.abs(G), jnp.abs(x))
-
-    def advance(state: _Iterate, dz: Float[Array, " m"]) -> _Iterate:
-        """Take the step if it lowers the residual; otherwise stop, or try a shorter one."""
-        z = state.z - state.damping * dz
-        r = problem.g(x + matvec(V, z))
-        level = jnp.max(jnp.abs(r) / scale)
-        better = ~state.finished & (level < state.level)
-        kept = jtu.tree_map(lambda new, old: jnp.where(better, new, old), (z, r, level), state[:3])
-        finished = jnp.all(jnp.abs(kept[1]) <= rounding) | (~better & (kept[2] <= tolerance))
-        damping = jnp.where(better, 1.0, state.damping / 4).astype(x.dtype)
-        return _Iterate(*kept, damping, state.iterations + jnp.where(state.finished, 0, 1), state.finished | finished)
-
-    def newton(state: _Iterate) -> _Iterate:
-        _, G_p = jacobian(problem.g, x + matvec(V, state.z))
-        return advance(state, factorize(matmul(G_p, V)).solve(state.r))
-
-    state = _Iterate(
-        jnp.zeros_like(r),
-        r,
-        jnp.max(jnp.abs(r) / scale),
-        jnp.ones((), x.dtype),
-        jnp.zeros((), jnp.int32),
-        jnp.all(jnp.abs(r) <= rounding),
-    )
-    for _ in range(min(2, max_steps)):
-        state = advance(state._replace(damping=jnp.ones((), x.dtype)), factorization.solve(state.r))
-    state = jax.lax.while_loop(
-        lambda s: ~s.finished & (s.iterations < max_steps) & jnp.isfinite(s.level),
-        newton,
-        state._replace(damping=jnp.ones((), x.dtype)),
-    )
-    success = (state.finished | (state.level <= tolerance)) & factorization.full_rank
-    p = jnp.where(success, x + matvec(V, state.z), x)
-    return _Root(p, state.z, state.iterations, state.level, factorization.full_rank, success)
+    r, G = jacobian(problem.g, problem.x)
+    directions = problem.weighted(G)
+    factorization = factorize(gram(G, directions))
+    equations = _Equations(problem, directions, row_scale(G, problem.x))
+    if far:
+        root = _damped_newton(equations, r, max_steps, tolerance)
+    else:
+        root = _chord(equations, r, factorization, max_steps)
+    success = (root.level <= tolerance) & factorization.full_rank
+    p = jnp.where(success, equations.point(root.z), problem.x)
+    return _Root(p, root.z, root.iterations, root.level, factorization.full_rank, success)
 
 
 # Differentiate g(p, theta) = 0 with p = x + V(x, theta) z:
@@ -243,9 +284,9 @@ def _solve(problem: _Problem, safe: Float[Array, " n"], max_steps: int, toleranc
 # in terms of the output root, so that the rule can itself be differentiated.
 @_solve.def_jvp
 def _solve_jvp(primals, tangents):
-    problem, safe, max_steps, tolerance = primals
-    problem_dot, _, _, _ = tangents
-    root = _solve(problem, safe, max_steps, tolerance)
+    problem, safe, max_steps, tolerance, far = primals
+    problem_dot, *_ = tangents
+    root = _solve(problem, safe, max_steps, tolerance, far)
     # A failed projection may have met NaN. Move to a point where g is finite *before*
     # differentiating: selecting afterwards would leave 0 * NaN in reverse mode.
     problem = problem._replace(x=jnp.where(root.success, problem.x, safe))
@@ -258,10 +299,11 @@ def _solve_jvp(primals, tangents):
     _, slope = eqx.filter_jvp(
         lambda q, p: q.g(p), (problem, p), (problem_dot, moved)
     )
-    V = problem.along(jacobian(problem.g, problem.x)[1])
-    B = matmul(jacobian(problem.g, p)[1], V)
+    directions = problem.weighted(jacobian(problem.g, problem.x)[1])
+    B = gram(jacobian(problem.g, p)[1], directions)
     dz = -factorize(B).solve(slope)
-    root_dot = _Root(moved + matvec(V, dz), dz, None, jnp.zeros_like(root.residual), None, None)
+    p_dot = moved + combine(dz, directions)
+    root_dot = _Root(p_dot, dz, None, jnp.zeros_like(root.residual), None, None)
     return root, root_dot
 
 
@@ -286,7 +328,8 @@ def project(
     **Returns:**
 
     `(p, info)`: the corrected point and a [`ProjectionInfo`][]. Where `info.success` is
-    false, `p` is `y` unchanged. Works under `jit`, `vmap`, `jvp` and `grad`.
+    false, `p` is `y` unchanged. The point may be far from the manifold: every Newton
+    iteration uses a new Jacobian, and a shorter step while the residual grows. Works under `jit`, `vmap`, `jvp` and `grad`.
 
     **Raises:**
 
@@ -298,4 +341,4 @@ def project(
     y = jtu.tree_map(jnp.asarray, y)
     check_constraint(constraint, t, y, args)
     projection = NewtonProjection(max_steps=50) if projection is None else projection
-    return projection(constraint, t, y, args)
+    return projection(constraint, t, y, args, far=True)

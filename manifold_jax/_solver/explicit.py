@@ -22,6 +22,7 @@ def is_unrollable(solver: dfx.AbstractSolver, terms: Any, t0, t1, y0: Y, args: A
     """Explicit, one tableau, and a vector field that may be evaluated on its own."""
     return (
         isinstance(solver, dfx.AbstractERK)
+        and not isinstance(solver, dfx.AbstractWrappedSolver)  # which answers for its inner solver
         and isinstance(solver.tableau, dfx.ButcherTableau)
         and not terms.is_vf_expensive(t0, t1, y0, args)
     )

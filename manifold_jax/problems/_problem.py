@@ -118,7 +118,8 @@ class Problem(eqx.Module):
         return self._rebuild(args=self.args, start=y0, y0=y0)
 
     def reference(self, t: Any) -> Any:
-        """The solution: exact, or published where no formula is known.
+        """The solution from `y0` (on the manifold): exact, or published where no formula is
+        known.
 
         **Arguments:**
 

@@ -131,12 +131,12 @@ def pendulum(
         module (`from manifold_jax.problems.pendulum import A01_X, A01_Y`). The text of the
         benchmark starts at `x = +1` in one place, its data at `x = -1`: mirror images.
     - IVP test set: `pendulum(gravity=1.0, v0=(0.0, 1.0), t1=1.0)`. Of the 18 printed
-        digits of the end values only 11 are right (`reference` is). Its multiplier is
-        twice the one of `phi = |q|^2 - L^2`.
+        digits of the end values only 11 are right (`reference` does not use them). Its
+        multiplier is twice $\lambda$.
 
     A known trap: the gravity with which a pendulum released from the horizontal returns
     after 2 s is `4 K(1/2)^2 = 13.750371636040745`; the value 13.7503716373294544 that is
-    often printed is off by 9.4e-11.
+    often printed is off by 9.4e-11 (relative).
 
     Sources: IFToMM Technical Committee for Multibody Dynamics, Library of Computational
     Benchmark Problems, A01; Mazzia & Magherini, Test Set for IVP Solvers.

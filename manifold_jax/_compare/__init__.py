@@ -1,0 +1,5 @@
+"""What the command line measures and prints: solvers side by side, and the paper's Table 1.
+
+A `Task` (task.py) is solved by every `Method` of the registry (methods.py; one file per
+library that solves), which yields a `Measurement`; report.py and figure.py show those.
+"""

@@ -1,0 +1,109 @@
+"""A picture of a comparison: the trajectory, the violation and the error over time."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import jax.tree_util as jtu
+import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from .methods import Measurement
+from .task import Task
+
+
+# Colour-blind safe (Okabe & Ito); black is the reference.
+COLOURS = ("#D55E00", "#0072B2", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
+# A violation or an error of exactly zero is drawn here.
+FLOOR = 1e-17
+
+
+def write_figure(path: Path, task: Task, measurements: Sequence[Measurement]) -> None:
+    matplotlib.use("Agg")
+    figure = Figure(figsize=(13, 4.2), layout="constrained")
+    shape = np.shape(jtu.tree_leaves(task.problem.y0)[0])
+    first = figure.add_subplot(1, 3, 1, projection="3d" if shape == (3,) else None)
+    second, third = figure.add_subplot(1, 3, 2), figure.add_subplot(1, 3, 3)
+    solved = [(COLOURS[i % len(COLOURS)], m) for i, m in enumerate(measurements) if not m.failure]
+    if shape in ((2,), (3,)):
+        _draw_path(first, task, solved, shape[0])
+    else:
+        _draw_components(first, task, solved, int(np.prod(shape)))
+    lines = _draw_violations(second, task, solved)
+    _draw_errors(third, task, solved)
+    figure.legend(
+        lines,
+        [m.row.method for _, m in solved],
+        loc="outside lower center",
+        ncols=max(len(solved), 1),
+        frameon=False,
+    )
+    figure.suptitle(f"{task.problem.name}, rtol = {task.rtol:g}, atol = {task.atol:g}")
+    figure.savefig(path, dpi=150)
+
+
+def _draw_path(axes: Axes, task: Task, solved: Sequence, dimension: int) -> None:
+    """The first leaf as a curve in the plane or in space."""
+    # Nested, the first the widest: usually the curves are the same to the eye.
+    for i, (colour, measurement) in enumerate(solved):
+        width = 1 + 1.2 * (len(solved) - 1 - i)
+        axes.plot(*measurement.states[:, :dimension].T, color=colour, linewidth=width)
+    known = task.reference()
+    if known is not None:
+        curve = known[1][:, :dimension].T
+        at_end = curve.shape[1] == 1
+        style, label = ("o", "solution at the end") if at_end else (":", "solution")
+        axes.plot(*curve, style, color="black", linewidth=1, markersize=5, label=label)
+        axes.legend(loc="upper right", frameon=False, fontsize="small")
+    axes.set(xlabel="$y_1$", ylabel="$y_2$", title="trajectory")
+    if dimension == 3:
+        axes.set_zlabel("$y_3$")
+        axes.locator_params(nbins=4)
+        axes.set_box_aspect(None, zoom=0.85)
+        return
+    extents = np.array([np.ptp(axes.get_xlim()), np.ptp(axes.get_ylim())])
+    # a circle should look like one, but quantities of different size need their own scales
+    if np.max(extents) < 3 * np.min(extents):
+        axes.set_aspect("equal", adjustable="datalim")
+
+
+def _draw_components(axes: Axes, task: Task, solved: Sequence, count: int) -> None:
+    """Too many components for a curve: those of the first leaf over time. One method only,
+    as the lines of several could not be told apart; the other panels show the differences."""
+    if not solved:
+        return
+    _, measurement = next((s for s in solved if s[1].row.method.startswith("projected")), solved[0])
+    colours = matplotlib.colormaps["viridis"](np.linspace(0, 0.9, count))
+    for i in range(count):
+        axes.plot(task.grid, measurement.states[:, i], color=colours[i], linewidth=1)
+    axes.set(xlabel="$t$", title=f"components, {measurement.row.method}")
+
+
+def _draw_violations(axes: Axes, task: Task, solved: Sequence) -> list:
+    lines = []
+    for colour, m in solved:
+        values = np.maximum(m.violations, FLOOR)
+        lines += axes.semilogy(task.grid, values, color=colour, linewidth=1)
+    axes.set(xlabel="$t$", title="violation, max $|g|$")
+    axes.grid(alpha=0.3)
+    return lines
+
+
+def _draw_errors(axes: Axes, task: Task, solved: Sequence) -> None:
+    axes.grid(alpha=0.3)
+    axes.set(xlabel="$t$", title="error of the state, max norm")
+    if task.reference() is None:
+        note = "solution not known\nfor this time span"
+        axes.text(0.5, 0.5, note, ha="center", va="center", transform=axes.transAxes)
+    elif task.problem.reference_at_end_only:
+        for i, (colour, m) in enumerate(solved):
+            axes.semilogy(i, max(m.row.error, FLOOR), "o", color=colour, markersize=8)
+        axes.set(xlabel="", xticks=[], xlim=(-1, len(solved)))
+        axes.set_title(f"error of the state at t = {task.t1:g}, max norm")
+    elif solved:
+        for colour, m in solved:
+            axes.semilogy(m.error_times, np.maximum(m.errors, FLOOR), color=colour, linewidth=1)
+        # The start is exact: seen in full, it would press everything else together.
+        errors = np.concatenate([m.errors for _, m in solved])
+        axes.set_ylim(bottom=max(np.quantile(errors, 0.01) / 10, FLOOR))

@@ -1,0 +1,123 @@
+"""The methods that are compared, and what is measured of each."""
+
+import dataclasses
+import functools
+from collections.abc import Callable, Iterator
+
+import numpy as np
+
+from .task import Run, SolveFailed, Task
+from .with_diffrax import run_plain, run_projected
+from .with_scipy import run_scipy
+
+
+@dataclasses.dataclass(frozen=True)
+class Method:
+    """- `label`: its name in tables, in which `{solver}` is the Diffrax solver asked for.
+    - `run`: solves a task; raises `SolveFailed` if it cannot.
+    """
+
+    label: str
+    run: Callable[[Task], Run]
+
+    def name(self, task: Task) -> str:
+        return self.label.format(solver=task.solver)
+
+
+# In the order of the tables.
+METHODS: tuple[Method, ...] = (
+    Method("plain {solver}", run_plain),
+    Method("projected {solver}", run_projected),
+    Method("scipy RK45", functools.partial(run_scipy, method="RK45")),
+    Method("scipy DOP853", functools.partial(run_scipy, method="DOP853")),
+    Method("scipy LSODA", functools.partial(run_scipy, method="LSODA")),
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class Row:
+    """One line of the table and of the JSON file; `None` where a number is not known.
+
+    Violations are the largest `|g|`, at the ends of the steps and on the output grid;
+    `error` is the largest error of a state component where the solution is known.
+    """
+
+    method: str
+    accepted: int | None = None
+    rejected: int | None = None
+    evaluations: int | None = None
+    violation_steps: float | None = None
+    violation_output: float | None = None
+    error: float | None = None
+    run_ms: float | None = None
+    compile_s: float | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class Measurement:
+    """A row, and the curves of the picture: states `(times, n)` and violations on the output
+    grid, errors where the solution is known. After a failed solve only `failure`, the
+    reason, is set."""
+
+    row: Row
+    failure: str | None = None
+    max_steps: int | None = None
+    states: np.ndarray | None = None
+    violations: np.ndarray | None = None
+    error_times: np.ndarray | None = None
+    errors: np.ndarray | None = None
+
+
+def measure_all(task: Task) -> Iterator[tuple[str, Callable[[], Measurement]]]:
+    """Name and measurement of each method, to be called one after the other."""
+    for method in METHODS:
+        yield method.name(task), functools.partial(measure, task, method)
+
+
+def measure(task: Task, method: Method) -> Measurement:
+    """Solve the task with one method; a failure is a result, too."""
+    name = method.name(task)
+    try:
+        run = method.run(task)
+        if not (np.all(np.isfinite(run.output)) and np.all(np.isfinite(run.steps))):
+            raise SolveFailed("the solution is not finite")
+    except SolveFailed as error:
+        return Measurement(Row(name), failure=str(error))
+    except Exception as error:  # of a library: the other methods are still of interest
+        reason = str(error).strip().partition("\n")[0]
+        return Measurement(Row(name), failure=f"{type(error).__name__}: {reason}")
+    violations = task.violations(task.grid, run.output)
+    error_times, errors = _errors(task, run)
+    row = Row(
+        name,
+        accepted=run.accepted,
+        rejected=run.rejected,
+        evaluations=run.evaluations,
+        violation_steps=_largest(task.violations(run.step_times, run.steps)),
+        violation_output=_largest(violations),
+        error=None if errors is None else _largest(errors),
+        run_ms=run.run_ms,
+        compile_s=run.compile_s,
+    )
+    return Measurement(
+        row,
+        max_steps=run.max_steps,
+        states=run.output,
+        violations=violations,
+        error_times=error_times,
+        errors=errors,
+    )
+
+
+def _errors(task: Task, run: Run) -> tuple[np.ndarray | None, np.ndarray | None]:
+    """Where the solution is known, and the largest error of a component there."""
+    known = task.reference()
+    if known is None:
+        return None, None
+    indices, states = known
+    return task.grid[indices], np.max(np.abs(run.output[indices] - states), axis=1)
+
+
+def _largest(values: np.ndarray) -> float | None:
+    largest = float(np.max(values))
+    return largest if np.isfinite(largest) else None

@@ -1,0 +1,192 @@
+"""Every problem x solver at tolerance 1e-8: on the manifold everywhere, and accurate.
+
+Violations and errors are recomputed in NumPy from the returned values.
+`pytest -s -n 0 tests/test_gallery.py` prints the table.
+"""
+
+import functools
+
+import diffrax as dfx
+import jax
+import jax.flatten_util as jfu
+import jax.numpy as jnp
+import manifold_jax as mj
+import numpy as np
+import numpy_residuals
+import optimistix as optx
+import outside
+import pytest
+
+
+TOLERANCE = 1e-8
+# Largest state error, in units of tolerance x (1 + |y|).
+ALLOWED = {"bosh3": 2000, "tsit5": 300, "dopri5": 300, "dopri8": 300, "kvaerno5": 300}
+SOLVERS = {
+    "bosh3": (dfx.Bosh3(), 16384),
+    "tsit5": (dfx.Tsit5(), 4096),
+    "dopri5": (dfx.Dopri5(), 4096),
+    "dopri8": (dfx.Dopri8(), 4096),
+    "kvaerno5": (dfx.Kvaerno5(), 16384),
+}
+CASES = [*mj.problems.ALL, "outside"]
+slow = lambda name: pytest.param(name, marks=pytest.mark.slow)
+QUICK = ["bosh3", "tsit5", slow("dopri5"), slow("dopri8"), "kvaerno5"]
+QUICKER = [slow("bosh3"), "tsit5", slow("dopri5"), slow("dopri8"), slow("kvaerno5")]
+
+
+class Case:
+    """One problem in the form the tests below need."""
+
+    def __init__(self, name):
+        if name == "outside":
+            self.terms, self.constraint, self.y0 = outside.terms(), outside.constraint(), outside.y0()
+            self.t0, self.t1, self.args = outside.T0, outside.T1, outside.parameters()
+            self.residual, self.reference, self.end_only = outside.residual_numpy, outside.exact, False
+        else:
+            problem = mj.problems.ALL[name]()
+            self.terms, self.constraint, self.y0 = problem.terms, problem.constraint, problem.y0
+            self.t0, self.t1, self.args = problem.t0, problem.t1, problem.args
+            self.residual = getattr(numpy_residuals, name.replace("-", "_"))
+            self.reference, self.end_only = problem.reference, problem.reference_at_end_only
+
+    def violation(self, t, y):
+        used = np.isfinite(np.asarray(t))
+        take = lambda leaf: np.asarray(leaf)[used]
+        assert used.any()
+        return np.abs(self.residual(take(t), jax.tree.map(take, y))).max()
+
+    def options(self, solver):
+        return dict(
+            args=self.args,
+            stepsize_controller=dfx.PIDController(rtol=TOLERANCE, atol=TOLERANCE),
+            max_steps=SOLVERS[solver][1],
+        )
+
+    @functools.cached_property
+    def event_function(self):
+        """Where some component of y crosses the middle of its range on the reference run."""
+        sol = mj.diffeqsolve(
+            self.terms,
+            mj.Projected(dfx.Tsit5(), self.constraint),
+            self.t0,
+            self.t1,
+            None,
+            self.y0,
+            saveat=dfx.SaveAt(ts=jnp.linspace(self.t0, self.t1, 101)),
+            **self.options("tsit5"),
+        )
+        ys = np.asarray(jax.vmap(lambda y: jfu.ravel_pytree(y)[0])(sol.ys))
+        j = int(np.argmax(np.ptp(ys, axis=0)))
+        middle = 0.5 * (ys[:, j].min() + ys[:, j].max())
+
+        def cond_fn(t, y, args, **kwargs):
+            return jfu.ravel_pytree(y)[0][j] - middle
+
+        return cond_fn
+
+
+@pytest.fixture(scope="module")
+def case(request):
+    return Case(request.param)
+
+
+@pytest.mark.parametrize("case", CASES, indirect=True)
+@pytest.mark.parametrize("solver", QUICK)
+def test_on_the_manifold_and_accurate(case, solver):
+    ts = jnp.linspace(case.t0, case.t1, 200)
+    saveat = dfx.SaveAt(
+        subs={
+            "ts": dfx.SubSaveAt(ts=ts),  # the last of them is t1
+            "steps": dfx.SubSaveAt(t0=True, steps=True),
+        },
+        dense=True,
+    )
+    sol = mj.diffeqsolve(
+        case.terms,
+        mj.Projected(SOLVERS[solver][0], case.constraint),
+        case.t0,
+        case.t1,
+        None,
+        case.y0,
+        saveat=saveat,
+        **case.options(solver),
+    )
+    for name in ("ts", "steps"):
+        assert case.violation(sol.ts[name], sol.ys[name]) <= 1e-12, name
+    times = case.t0 + (case.t1 - case.t0) * np.random.default_rng(0).uniform(size=1000)
+    dense = jax.jit(jax.vmap(sol.evaluate))(jnp.asarray(times))
+    assert case.violation(times, dense) <= 1e-12
+
+    first = -1 if case.end_only else 0
+    compared, values = ts[first:], jax.tree.map(lambda leaf: leaf[first:], sol.ys["ts"])
+    reference = case.reference(np.asarray(compared))
+    errors = jax.tree.map(lambda a, b: np.abs(np.asarray(a) - b) / (1 + np.abs(b)), values, reference)
+    worst = max(error.max() for error in jax.tree.leaves(errors)) / TOLERANCE
+    steps = int(sol.stats["num_accepted_steps"])
+    violation = case.violation(sol.ts["ts"], sol.ys["ts"])
+    print(f"{solver:9s} steps {steps:6d}  violation {violation:.1e}  error / tol (1 + |y|) {worst:8.2f}")
+    assert worst <= ALLOWED[solver]
+
+
+@pytest.mark.parametrize("case", CASES, indirect=True)
+@pytest.mark.parametrize("solver", QUICKER)
+def test_steps_with_plain_diffrax(case, solver):
+    sol = dfx.diffeqsolve(
+        case.terms,
+        mj.Projected(SOLVERS[solver][0], case.constraint),
+        case.t0,
+        case.t1,
+        1e-3,
+        case.y0,
+        saveat=dfx.SaveAt(t0=True, steps=True, t1=True),
+        **case.options(solver),
+    )
+    assert case.violation(sol.ts, sol.ys) <= 1e-12
+
+
+@pytest.mark.parametrize("case", CASES, indirect=True)
+@pytest.mark.parametrize("solver", QUICKER)
+def test_event_is_on_the_manifold(case, solver):
+    cond_fn = case.event_function
+    sol = mj.diffeqsolve(
+        case.terms,
+        mj.Projected(SOLVERS[solver][0], case.constraint),
+        case.t0,
+        case.t1,
+        None,
+        case.y0,
+        event=dfx.Event(cond_fn, optx.Bisection(rtol=1e-12, atol=1e-12)),
+        **case.options(solver),
+    )
+    assert sol.result == dfx.RESULTS.event_occurred
+    assert case.t0 < float(sol.ts[0]) < case.t1
+    assert case.violation(sol.ts, sol.ys) <= 1e-12
+    assert abs(cond_fn(sol.ts[0], jax.tree.map(lambda leaf: leaf[0], sol.ys), case.args)) <= 1e-8
+
+
+@pytest.mark.parametrize("case", ["car-axis", "skate", "outside"], indirect=True)
+@pytest.mark.parametrize("solver", QUICKER)
+def test_backward_in_time(case, solver):
+    """Time-dependent constraints, from t1 back to t0; the start is the end of a forward run."""
+    projected = mj.Projected(SOLVERS[solver][0], case.constraint)
+    forward = mj.diffeqsolve(
+        case.terms, projected, case.t0, case.t1, None, case.y0, **case.options(solver)
+    )
+    end = jax.tree.map(lambda leaf: leaf[0], forward.ys)
+    ts = jnp.linspace(case.t1, case.t0, 200)
+    sol = mj.diffeqsolve(
+        case.terms,
+        projected,
+        case.t1,
+        case.t0,
+        None,
+        end,
+        saveat=dfx.SaveAt(subs=[dfx.SubSaveAt(ts=ts), dfx.SubSaveAt(steps=True)], dense=True),
+        **case.options(solver),
+    )
+    assert case.violation(sol.ts[0], sol.ys[0]) <= 1e-12
+    assert case.violation(sol.ts[1], sol.ys[1]) <= 1e-12
+    times = np.random.default_rng(1).uniform(case.t0, case.t1, size=1000)
+    assert case.violation(times, jax.jit(jax.vmap(sol.evaluate))(jnp.asarray(times))) <= 1e-12
+    for back, start in zip(jax.tree.leaves(sol.ys[0]), jax.tree.leaves(case.y0)):
+        assert np.abs(back[-1] - start).max() <= 1e-4
