@@ -23,6 +23,7 @@ app = typer.Typer(
     "solvers, reprint the paper's table. Computes in double precision.",
     no_args_is_help=True,
     add_completion=False,
+    rich_markup_mode="markdown",  # which joins the lines of a paragraph
     pretty_exceptions_show_locals=False,
 )
 
@@ -40,8 +41,7 @@ def _settings() -> None:
 
 @app.command("list")
 def list_problems() -> None:
-    """List the problems of the gallery: states n, constraints m, and where the solution is
-    known."""
+    """List the gallery: states n, constraints m, and where the solution is known."""
     from ._compare.report import gallery_table
     from .problems import ALL
 

@@ -193,6 +193,7 @@ def check_constraint(constraint: AbstractConstraint, t: RealScalarLike, y: Y, ar
     return m
 
 
+@eqx.filter_jit
 def constraint_violation(
     constraint: AbstractConstraint, t: Any, y: Y, args: Args = None
 ) -> FloatScalar:

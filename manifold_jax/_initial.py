@@ -26,6 +26,7 @@ _MESSAGES = (
 )
 
 
+@eqx.filter_jit
 def consistent_state(
     constraint: AbstractConstraint,
     t: RealScalarLike,

@@ -307,6 +307,7 @@ def _solve_jvp(primals, tangents):
     return root, root_dot
 
 
+@eqx.filter_jit
 def project(
     constraint: AbstractConstraint,
     t: RealScalarLike,

@@ -1,5 +1,4 @@
-"""The gallery itself: every reference against the constraint, the vector field, SciPy,
-and the published numbers."""
+"""Every reference against its constraint, its vector field, SciPy, and published numbers."""
 
 import decimal
 

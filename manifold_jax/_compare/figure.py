@@ -8,6 +8,7 @@ import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from mpl_toolkits.mplot3d import Axes3D
 
 from .methods import Measurement
 from .task import Task
@@ -57,10 +58,10 @@ def _draw_path(axes: Axes, task: Task, solved: Sequence, dimension: int) -> None
         axes.plot(*curve, style, color="black", linewidth=1, markersize=5, label=label)
         axes.legend(loc="upper right", frameon=False, fontsize="small")
     axes.set(xlabel="$y_1$", ylabel="$y_2$", title="trajectory")
-    if dimension == 3:
+    if isinstance(axes, Axes3D):
         axes.set_zlabel("$y_3$")
         axes.locator_params(nbins=4)
-        axes.set_box_aspect(None, zoom=0.85)
+        axes.set_box_aspect(None, zoom=0.85)  # pyright: ignore
         return
     extents = np.array([np.ptp(axes.get_xlim()), np.ptp(axes.get_ylim())])
     # a circle should look like one, but quantities of different size need their own scales
@@ -69,8 +70,11 @@ def _draw_path(axes: Axes, task: Task, solved: Sequence, dimension: int) -> None
 
 
 def _draw_components(axes: Axes, task: Task, solved: Sequence, count: int) -> None:
-    """Too many components for a curve: those of the first leaf over time. One method only,
-    as the lines of several could not be told apart; the other panels show the differences."""
+    """The first leaf over time, if it has too many components for a curve.
+
+    Of one method only, as the lines of several could not be told apart; the other panels
+    show the differences.
+    """
     if not solved:
         return
     _, measurement = next((s for s in solved if s[1].row.method.startswith("projected")), solved[0])

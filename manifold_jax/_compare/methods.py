@@ -13,7 +13,9 @@ from .with_scipy import run_scipy
 
 @dataclasses.dataclass(frozen=True)
 class Method:
-    """- `label`: its name in tables, in which `{solver}` is the Diffrax solver asked for.
+    """One way to solve a task.
+
+    - `label`: its name in tables, in which `{solver}` is the Diffrax solver asked for.
     - `run`: solves a task; raises `SolveFailed` if it cannot.
     """
 
@@ -55,9 +57,11 @@ class Row:
 
 @dataclasses.dataclass(frozen=True)
 class Measurement:
-    """A row, and the curves of the picture: states `(times, n)` and violations on the output
-    grid, errors where the solution is known. After a failed solve only `failure`, the
-    reason, is set."""
+    """A row of the table and the curves of the picture.
+
+    States `(times, n)` and violations are on the output grid, errors where the solution is
+    known. After a failed solve only `failure`, the reason, is set.
+    """
 
     row: Row
     failure: str | None = None

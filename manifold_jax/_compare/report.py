@@ -55,7 +55,7 @@ def gallery_table(gallery: dict[str, Callable[[], Problem]]) -> Table:
 
 def summary(build: Callable[[], Problem]) -> str:
     """What a problem is, in one line: the beginning of its docstring, without mathematics."""
-    paragraph = inspect.getdoc(build).partition("\n\n")[0]
+    paragraph = (inspect.getdoc(build) or "").partition("\n\n")[0]
     text = " ".join(paragraph.split())
     return re.split(r"[,:.]( |$)", text, maxsplit=1)[0].replace("$", "")
 
@@ -75,7 +75,7 @@ def comparison_table(task: Task, measurements: Sequence[Measurement]) -> Table:
     ):
         table.add_column(heading, justify="right")
     for measurement in measurements:
-        row = measurement.row
+        row, failure = measurement.row, measurement.failure
         table.add_row(
             row.method,
             _number(row.accepted, "d"),
@@ -83,7 +83,9 @@ def comparison_table(task: Task, measurements: Sequence[Measurement]) -> Table:
             _number(row.evaluations, "d"),
             _number(row.violation_steps, ".1e"),
             _number(row.violation_output, ".1e"),
-            _number(row.error, ".1e") if measurement.failure is None else _failure(measurement),
+            _number(row.error, ".1e")
+            if failure is None
+            else f"[red]failed: {escape(failure)}[/red]",
             _number(row.run_ms, ".3g" if (row.run_ms or 0) < 100 else ".0f"),
             _number(row.compile_s, ".2f"),
         )
@@ -92,10 +94,6 @@ def comparison_table(task: Task, measurements: Sequence[Measurement]) -> Table:
 
 def _number(value: int | float | None, fmt: str) -> str:
     return "-" if value is None else format(value, fmt)
-
-
-def _failure(measurement: Measurement) -> str:
-    return f"[red]failed: {escape(measurement.failure)}[/red]"
 
 
 def comparison_notes(task: Task, measurements: Sequence[Measurement]) -> list[str]:

@@ -40,8 +40,11 @@ LAST_MAX_STEPS = 2**20
 
 
 class _Solve(NamedTuple):
-    """A way to solve a task: the function, the solver, and the number of evaluations of the
-    vector field that it needs before the solver starts."""
+    """How a task is solved.
+
+    - `function`, `solver`: the function that solves, and what to pass to it.
+    - `extra_evaluations`: of the vector field, before the solver starts.
+    """
 
     function: Callable[..., dfx.Solution]
     solver: dfx.AbstractSolver
@@ -127,8 +130,10 @@ def _compiled(
 
 
 def _sufficient_max_steps(task: Task, solve: _Solve) -> int:
-    """The first of 4096, 8192, ... with which the solve finishes. Found by one solve that
-    keeps the end only, as each limit is another program to compile."""
+    """The first of 4096, 8192, ... with which the solve finishes.
+
+    Found by one solve that keeps the end only, as each limit is another program to compile.
+    """
     program, _ = _compiled(task, solve, dfx.SaveAt(t1=True), LAST_MAX_STEPS)
     outcome = program()
     _raise_if_failed(outcome)
@@ -150,8 +155,10 @@ def _raise_if_failed(outcome: _Outcome) -> None:
 
 
 def _steps(task: Task, solve: _Solve, max_steps: int) -> tuple[np.ndarray, np.ndarray, int | None]:
-    """Ends of the accepted steps, states there, and for implicit solvers the number of
-    evaluations of the vector field, counted as they happen."""
+    """Ends of the accepted steps, states there, and the evaluations of the vector field.
+
+    The latter for implicit solvers only, counted as they happen.
+    """
     count = 0
 
     def increment():
@@ -174,11 +181,15 @@ def _steps(task: Task, solve: _Solve, max_steps: int) -> tuple[np.ndarray, np.nd
 
 
 def _explicit_evaluations(task: Task, solve: _Solve, steps: int) -> int | None:
-    """Evaluations of the vector field by an explicit solver in so many steps, accepted or
-    not: its last stage is the first of the next step if the tableau says so."""
-    tableau = getattr(SOLVERS[task.solver](), "tableau", None)
-    if not isinstance(tableau, dfx.ButcherTableau) or tableau.implicit:
+    """Evaluations of the vector field by an explicit solver in so many steps, accepted or not.
+
+    The last stage is the first one of the next step if the tableau says so.
+    """
+    solver = SOLVERS[task.solver]()
+    if not isinstance(solver, dfx.AbstractERK):
         return None
+    tableau = solver.tableau
+    assert isinstance(tableau, dfx.ButcherTableau)  # several are for several vector fields
     reused = tableau.fsal and tableau.ssal
     in_steps = 1 + (tableau.num_stages - 1) * steps if reused else tableau.num_stages * steps
     return in_steps + solve.extra_evaluations

@@ -51,6 +51,7 @@ def explicit_step(
     returned besides the state.
     """
     control = terms.contr(t0, t1)
+    vf = jax.jit(lambda t, y: terms.vf(t, y, args))  # traced once, not once per stage
     last = len(tableau.a_lower) - 1
     f, increments = f0, [terms.prod(f0, control)]
     fsal = is_first_same_as_last(tableau)
@@ -60,8 +61,8 @@ def explicit_step(
         if fsal and i == last:
             raw, (y, info) = y, correct(y)
         # The last node of most methods is exactly 1; `t0 + 1 (t1 - t0)` may not be `t1`.
-        t = t1 if c == 1 else t0 + float(c) * (t1 - t0)
-        f = terms.vf(t, y, args)
+        t = jnp.asarray(t1 if c == 1 else t0 + float(c) * (t1 - t0))
+        f = vf(t, y)
         increments.append(terms.prod(f, control))
     if not fsal:
         raw = _combine(tableau.b_sol, increments, y0)

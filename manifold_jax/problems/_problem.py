@@ -94,9 +94,10 @@ class Problem(eqx.Module):
         return self._at_end_only
 
     def with_args(self, args: Args) -> "Problem":
-        """The same problem with other parameters. What depends on them is rebuilt, the
-        initial state and the constraint, so that derivatives with respect to `args` of
-        anything computed from the result are complete.
+        """The same problem with other parameters.
+
+        What depends on them is rebuilt, the initial state and the constraint, so that
+        derivatives with respect to `args` of anything computed from the result are complete.
 
         ```python
         def end_position(gravity):
@@ -112,14 +113,15 @@ class Problem(eqx.Module):
         return self._rebuild(args=args, start=self.start, y0=None)
 
     def with_initial(self, y0: Y) -> "Problem":
-        """The same problem from the initial state `y0` at `t0` (used as it is; values of
-        conserved quantities are frozen there)."""
+        """The same problem from the initial state `y0` at `t0`.
+
+        The state is used as it is; values of conserved quantities are frozen there.
+        """
         y0 = jtu.tree_map(as_floating, y0)
         return self._rebuild(args=self.args, start=y0, y0=y0)
 
     def reference(self, t: Any) -> Any:
-        """The solution from `y0` (on the manifold): exact, or published where no formula is
-        known.
+        """The solution from `y0`: exact, or published where no formula is known.
 
         **Arguments:**
 
@@ -130,7 +132,7 @@ class Problem(eqx.Module):
 
         The layout of `y0` in NumPy float64, with a leading axis of length `times` if `t`
         has one. Raises `ValueError` for times, parameters or initial states at which the
-        solution is not known.
+        solution is not known. Formulas hold for a `y0` on the manifold.
         """
         t = np.asarray(t, np.float64)
         if t.ndim > 1:

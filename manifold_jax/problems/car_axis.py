@@ -147,8 +147,10 @@ def car_axis(
     road_frequency: Any = 10.0,
     gravity: Any = 1.0,
 ) -> Problem:
-    r"""A car axis between two springs, $q = (x_l, y_l, x_r, y_r)$. The left wheel stays at
-    the origin, the right one rides over a bumpy road at $(x_b, y_b)$,
+    r"""A car axis between two springs on a bumpy road (index 3).
+
+    $q = (x_l, y_l, x_r, y_r)$ are the ends of the axis. The left wheel stays at the
+    origin, the right one rides over the road at $(x_b, y_b)$,
     $y_b = r \sin \omega t$, $x_b = (L^2 - y_b^2)^{1/2}$:
 
     $$k q'' = Q(t, q) - J^T \lambda, \quad k = M \epsilon^2 / 2, \quad

@@ -17,8 +17,10 @@ State: TypeAlias = tuple[Float[Array, "2"], Float[Array, "2"]]
 
 
 class KeplerArgs(NamedTuple):
-    """Parameters of `kepler`: the gravitational parameter, and the eccentricity of the
-    standard initial state (the vector field does not depend on it)."""
+    """Parameters of `kepler`: the gravitational parameter and the eccentricity.
+
+    The eccentricity is that of the standard orbit; the vector field does not use it.
+    """
 
     mu: Any = 1.0
     eccentricity: Any = 0.6

@@ -50,9 +50,11 @@ def _make_constraint(args: RigidBodyArgs, y0: Float[Array, "3"]) -> Invariants:
 
 
 def _exact(t: np.ndarray, args: RigidBodyArgs, y0: np.ndarray) -> np.ndarray:
-    """Jacobi elliptic functions, from any initial state and for any moments of inertia:
+    """Jacobi elliptic functions, from any initial state and for any moments of inertia.
+
     `y = (s a1 dn, s' a2 sn, a3 cn)`, where axis 1 is the one that the momentum circles
-    (largest or smallest inertia) and axis 2 the middle one."""
+    (largest or smallest inertia) and axis 2 the middle one.
+    """
     inertia = args.inertia
     rest = np.broadcast_to(y0, (t.size, 3)).copy()
     order = np.argsort(-inertia)
@@ -91,8 +93,10 @@ def rigid_body(
     y0: Any = STANDARD_START,
     t1: float = 30.0,
 ) -> Problem:
-    r"""Euler's equations of the free rigid body for its angular momentum $y$ in the body
-    frame, with two invariants, the Casimir $|y|^2$ and the energy:
+    r"""Euler's equations of the free rigid body.
+
+    For its angular momentum $y$ in the body frame, with two invariants, the Casimir
+    $|y|^2$ and the energy:
 
     $$y' = y \times \omega, \quad \omega_i = y_i / I_i, \quad
     |y|^2 = \text{const}, \quad \tfrac12 \textstyle\sum_i y_i^2 / I_i = \text{const}.$$
@@ -104,9 +108,8 @@ def rigid_body(
     **Arguments:**
 
     - `inertia`: principal moments of inertia, shape `(3,)`, `args.inertia`.
-    - `y0`: initial angular momentum, shape `(3,)`, by default
-        `(cos 1.1, 0, sin 1.1)`. `with_args` keeps it and freezes the
-        invariants anew.
+    - `y0`: initial angular momentum, shape `(3,)`, by default `(cos 1.1, 0, sin 1.1)`.
+        `with_args` keeps it and freezes the invariants anew.
     - `t1`: the end of the time span.
 
     Source: Hairer, Lubich & Wanner, Geometric Numerical Integration (2nd ed., 2006),

@@ -1,5 +1,7 @@
-"""Small problems from the literature on differential-algebraic equations, each with an
-elementary solution and written as a vector field on a manifold."""
+"""Small differential-algebraic equations from the literature, as flows on a manifold.
+
+Each has an elementary solution.
+"""
 
 import math
 from typing import Any, NamedTuple, TypeAlias
@@ -191,8 +193,9 @@ def _skate_exact(t: np.ndarray, args: SkateArgs, y0: Any) -> tuple[np.ndarray, n
 
 
 def skate(*, slope: Any = 0.8) -> Problem:
-    r"""A skate (knife edge) on an inclined plane, turning at unit rate; it cannot slip
-    sideways, a nonholonomic constraint on the velocity that depends on time:
+    r"""A skate (knife edge) on an inclined plane, turning at unit rate.
+
+    It cannot slip sideways, a nonholonomic constraint on the velocity that depends on time:
 
     $$q'' = (\sin\alpha + w \sin t, -w \cos t), \quad q_2' \cos t - q_1' \sin t = 0,$$
 
