@@ -143,12 +143,11 @@ def check_state(y: Y, name: str = "y0") -> None:
     if len(leaves) == 0:
         raise ValueError(f"`{name}` has no array leaves: pass the state as a pytree of real arrays.")
     for leaf in leaves:
-        try:
-            dtype = jnp.result_type(leaf)
-        except TypeError as error:
+        if not eqx.is_array_like(leaf):
             raise TypeError(
                 f"`{name}` must be a pytree of real arrays, but has a leaf of type {type(leaf).__name__}."
-            ) from error
+            )
+        dtype = jnp.result_type(leaf)
         if jnp.issubdtype(dtype, jnp.complexfloating):
             raise TypeError(
                 f"`{name}` has a complex leaf ({dtype}). Integrate its real and imaginary parts: "

@@ -118,7 +118,10 @@ def diffeqsolve(
         **options,
     )
     sol = _finish(sol, solver, saveat, event, y0, args, start)
-    return sol.result.error_if(sol, ~is_okay(sol.result)) if throw else sol
+    if not throw:
+        return sol
+    # A bad start has raised its own, clearer error.
+    return sol.result.error_if(sol, ~is_okay(sol.result) & start.success)
 
 
 def _check_arguments(adjoint: Any, consistent: str) -> None:

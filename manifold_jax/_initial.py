@@ -119,11 +119,13 @@ def initial_step(
 ) -> FloatScalar:
     """First step of an adaptive solve of an ODE, signed like `t1 - t0`.
 
-    Diffrax has the same estimate but never reaches it and starts with 0.01 whatever the
-    problem. Two evaluations of the vector field bound the first and second derivatives in
-    the controller's norm.
+    Diffrax has such an estimate but never reaches it and starts with 0.01 whatever the
+    problem. Two evaluations of the vector field give its size `d1` and its rate of change
+    `r = d2 / d1`, in the controller's norm; the step solves `d1 h (r h)^p = 1/100`, so that
+    it does not depend on the unit of time.
 
-    Source: Hairer, Norsett & Wanner, Solving ODEs I, section II.4 (starting step size).
+    Source: after Hairer, Norsett & Wanner, Solving ODEs I, section II.4 (starting step
+    size), whose last formula depends on that unit.
     """
     t0, t1 = jnp.asarray(t0), jnp.asarray(t1)
     order = solver.error_order(terms)
@@ -136,20 +138,18 @@ def initial_step(
     f0 = terms.vf(t0, y0, args)
     d0, d1 = norm(y0), norm(f0)
     small = (d0 < 1e-5) | (d1 < 1e-5)
-    h0 = jnp.where(small, 1e-6, 0.01 * d0 / jnp.where(small, 1.0, d1))
+    span = jnp.abs(t1 - t0)
+    h0 = jnp.where(small, 1e-6 * span, 0.01 * d0 / jnp.where(small, 1.0, d1))
     step = direction * h0
     y1 = jtu.tree_map(lambda y, f: y + (step * f).astype(y.dtype), y0, f0)
     f1 = terms.vf(t0 + step, y1, args)
-    d2 = norm(jtu.tree_map(jnp.subtract, f1, f0)) / h0
-    flat = jnp.maximum(d1, d2) <= 1e-15
-    h1 = jnp.where(
-        flat,
-        jnp.maximum(1e-6, h0 * 1e-3),
-        (0.01 / jnp.where(flat, 1.0, jnp.maximum(d1, d2))) ** (1 / order),
-    )
-    h = jnp.minimum(jnp.minimum(100 * h0, h1), jnp.abs(t1 - t0))
+    rate = norm(jtu.tree_map(jnp.subtract, f1, f0)) / h0 / jnp.where(small, 1.0, d1)
+    power = 1 / (order + 1)
+    h1 = (0.01 / jnp.where(small, 1.0, d1)) ** power * rate ** (-order * power)
+    h = jnp.where(small, h0, jnp.minimum(100 * h0, h1))
     # A vector field that is not finite near the start says nothing about the step.
-    h = jnp.where(jnp.isfinite(h) & (h > 0), h, jnp.minimum(0.01, jnp.abs(t1 - t0)))
+    h = jnp.where(jnp.isfinite(h) & (h > 0), h, 1e-3 * span)
+    h = jnp.minimum(h, span)
     return jax.lax.stop_gradient(direction * h)
 
 

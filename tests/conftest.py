@@ -5,6 +5,7 @@ import os
 os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0")
 
 import jax  # noqa: E402
+import jaxtyping  # noqa: E402
 import pytest  # noqa: E402
 
 
@@ -18,3 +19,11 @@ def _bounded_memory():
     """Compiled programs of one file are of no use to the next, and there are many."""
     yield
     jax.clear_caches()
+
+
+@pytest.fixture
+def as_a_user_meets_it():
+    """Without the runtime type checks of the tests, which would answer before the library."""
+    jaxtyping.config.update("jaxtyping_disable", True)
+    yield
+    jaxtyping.config.update("jaxtyping_disable", False)

@@ -47,7 +47,7 @@ def field(t, y, args):
 
 def residual(t, y, args):
     u = _unpack(y) / _stretch(t)
-    return {"sphere": u @ u - 1, "cone": args.omega @ u - args.omega @ jnp.asarray(START)}
+    return {"sphere": u @ u - 1, "cone": args.omega @ u - args.omega @ jnp.asarray(START, u.dtype)}
 
 
 def exact(t, omega=OMEGA):

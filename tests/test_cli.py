@@ -371,7 +371,6 @@ def test_paper_keeps_the_circle(paper_rows):
         assert 0 < row.violation <= 16 * np.finfo(float).eps
 
 
-@pytest.mark.xfail(strict=True, reason="the correction stops at 4 rounding units")
 def test_paper_keeps_the_circle_to_the_last_bit(paper_rows):
     assert max(row.violation for row in paper_rows) <= 5e-16
 

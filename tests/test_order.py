@@ -18,28 +18,29 @@ import pytest
 NEWTON = dict(root_finder=optx.Newton(rtol=1e-13, atol=1e-14))
 # Solver, expected order, and step counts whose errors lie in the range of the fit.
 METHODS = {
-    "Euler": (dfx.Euler(), 1, [1024, 2048, 4096, 8192, 16384]),
+    "Euler": (dfx.Euler(), 1, [16384, 32768, 65536, 131072]),
     "Heun": (dfx.Heun(), 2, [256, 512, 1024, 2048, 4096]),
     "Bosh3": (dfx.Bosh3(), 3, [128, 256, 512, 1024, 2048]),
     "Dopri5": (dfx.Dopri5(), 5, [128, 192, 256, 384, 512]),
-    "Tsit5": (dfx.Tsit5(), 5, [256, 384, 512, 640, 768]),
+    # Its fourth-order error terms are small: the order shows at fine steps only.
+    "Tsit5": (dfx.Tsit5(), 5, [192, 256, 320, 384]),
     "Kvaerno3": (dfx.Kvaerno3(**NEWTON), 3, [128, 256, 512, 1024, 2048]),
-    "Kvaerno5": (dfx.Kvaerno5(**NEWTON), 5, [96, 128, 192, 256, 384]),
-    "Dopri8": (dfx.Dopri8(), 8, [24, 32, 40, 48, 64]),
+    "Kvaerno5": (dfx.Kvaerno5(**NEWTON), 5, [128, 192, 256, 384, 512]),
+    "Dopri8": (dfx.Dopri8(), 8, [12, 14, 16, 20, 24, 28, 32, 40]),
 }
 
 
 def sphere_only():
     """The rigid body with |y|^2 = 1 as its only constraint."""
     problem = mj.problems.rigid_body()
-    end = 4.0
+    end = 20.0
     constraint = mj.Constraint(lambda t, y, args: y @ y - 1.0)
     return problem, constraint, end
 
 
 def pendulum():
     problem = mj.problems.pendulum(q0=(0.8, -0.6), v0=(0.3, 0.4))
-    return problem, problem.constraint, 2.0
+    return problem, problem.constraint, 3.0
 
 
 def fitted_order(solver, counts, problem, constraint, end):
@@ -49,7 +50,7 @@ def fitted_order(solver, counts, problem, constraint, end):
     @jax.jit
     def solve(dt0):
         sol = mj.diffeqsolve(
-            problem.terms, projected, 0.0, end, dt0, problem.y0, problem.args, max_steps=20000
+            problem.terms, projected, 0.0, end, dt0, problem.y0, problem.args, max_steps=140000
         )
         return jfu.ravel_pytree(sol.ys)[0]
 

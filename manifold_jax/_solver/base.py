@@ -79,11 +79,6 @@ def check_inner_solver(solver: Any, hook: str) -> None:
         raise TypeError(f"`solver` must be an instance: write `{hook}({solver.__name__}(), ...)`.")
     if not isinstance(solver, dfx.AbstractSolver):
         raise TypeError(f"`solver` must be a Diffrax solver, got {type(solver).__name__}.")
-    if isinstance(solver, AbstractManifoldSolver):
-        raise ValueError(
-            f"`solver` is already a {type(solver).__name__}. Put all equations into one constraint: "
-            f"`{hook}(solver, constraint)`."
-        )
     if isinstance(solver, dfx.HalfSolver):
         if isinstance(solver.solver, AbstractManifoldSolver):
             raise ValueError(
@@ -97,6 +92,11 @@ def check_inner_solver(solver: Any, hook: str) -> None:
                 f"`{hook}({type(solver.solver).__name__}(), constraint)`."
             )
         solver = solver.solver
+    if isinstance(solver, AbstractManifoldSolver):
+        raise ValueError(
+            f"`solver` is already a {type(solver).__name__}. Put all equations into one constraint: "
+            f"`{hook}(solver, constraint)`."
+        )
     name = type(solver).__name__
     if isinstance(solver, dfx.ItoMilstein):
         raise ValueError(

@@ -1,0 +1,152 @@
+"""What the benchmarks share: timing, the checks of a solution, and where a result was made."""
+
+import dataclasses
+import json
+import math
+import os
+import platform
+import statistics
+import time
+from collections.abc import Callable, Mapping
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+
+# What a result depends on, in every JSON file.
+PACKAGES = ("manifold_jax", "jax", "jaxlib", "diffrax", "equinox", "numpy", "scipy")
+
+
+@dataclasses.dataclass(frozen=True)
+class Timing:
+    """Milliseconds of a run: the median, and the quartiles of all repeats."""
+
+    median_ms: float
+    low_ms: float
+    high_ms: float
+
+
+def interleaved(runs: Mapping[str, Callable[[], Any]], repeats: int) -> dict[str, Timing]:
+    """Time programs in turn, so that a disturbance of the machine meets all of them alike.
+
+    Every round starts with another one: each is as often first and after each other. Programs
+    have to block until they are done, and must have been run before.
+    """
+    names = list(runs)
+    durations: dict[str, list[float]] = {name: [] for name in names}
+    for k in range(repeats):
+        shift = k % len(names)
+        for name in names[shift:] + names[:shift]:
+            start = time.perf_counter()
+            runs[name]()
+            durations[name].append(1e3 * (time.perf_counter() - start))
+    return {name: _timing(values) for name, values in durations.items()}
+
+
+def _timing(values: list[float]) -> Timing:
+    low, high = np.quantile(values, (0.25, 0.75))
+    return Timing(statistics.median(values), float(low), float(high))
+
+
+@dataclasses.dataclass(frozen=True)
+class CompileTime:
+    """Seconds from a Python function to a program: by the clock, and of the process."""
+
+    wall_s: float
+    process_s: float
+
+
+def compiled(function: Callable, *args: Any) -> tuple[Callable[[], Any], CompileTime]:
+    """The program for `function(*args)`, and what tracing and compiling from scratch takes.
+
+    The program takes no arguments and blocks until its result is there.
+    """
+    # Otherwise the second program profits from what was traced for the first.
+    jax.clear_caches()
+    wall, process = time.perf_counter(), time.process_time()
+    program = jax.jit(function).lower(*args).compile()
+    seconds = CompileTime(time.perf_counter() - wall, time.process_time() - process)
+    return lambda: jax.block_until_ready(program(*args)), seconds
+
+
+def median_compile_times(
+    functions: Mapping[str, tuple[Callable, tuple[Any, ...]]], repeats: int
+) -> dict[str, CompileTime]:
+    """Compile every `function(*args)` in turn, after a round that is not counted."""
+    seconds: dict[str, list[CompileTime]] = {name: [] for name in functions}
+    for k in range(repeats + 1):
+        for name, (function, args) in functions.items():
+            _, elapsed = compiled(function, *args)
+            if k > 0:
+                seconds[name].append(elapsed)
+    return {
+        name: CompileTime(
+            statistics.median(s.wall_s for s in values),
+            statistics.median(s.process_s for s in values),
+        )
+        for name, values in seconds.items()
+    }
+
+
+def pendulum_violations(rows: np.ndarray) -> tuple[float, float]:
+    """Largest `|x^2 + y^2 - 1|` and `|x u + y v|` of states `(x, y, u, v)` in the last axis."""
+    x, y, u, v = np.moveaxis(np.asarray(rows, np.float64), -1, 0)
+    return float(np.max(np.abs(x * x + y * y - 1))), float(np.max(np.abs(x * u + y * v)))
+
+
+def largest_difference(rows: np.ndarray, reference: np.ndarray) -> float:
+    """Largest error of a state component."""
+    return float(np.max(np.abs(rows - reference)))
+
+
+def environment(*packages: str) -> dict[str, Any]:
+    """Where a result was made. Of `packages`, those that are installed are listed, too."""
+    return {
+        "device": jax.devices()[0].device_kind,
+        "cpu_count": os.cpu_count(),
+        "machine": platform.machine(),
+        "versions": {"python": platform.python_version(), **_versions(PACKAGES + packages)},
+    }
+
+
+def _versions(packages: tuple[str, ...]) -> dict[str, str]:
+    versions = {}
+    for package in packages:
+        try:
+            versions[package] = version(package)
+        except PackageNotFoundError:
+            continue
+    return versions
+
+
+def use_double_precision() -> None:
+    """Settings of all benchmarks. Compiled programs are not taken from the disk."""
+    jax.config.update("jax_enable_x64", True)
+    jax.config.update("jax_enable_compilation_cache", False)
+
+
+def write_json(path: Path, content: Any) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(_strict(content), indent=2, allow_nan=False) + "\n")
+
+
+def _strict(value: Any) -> Any:
+    """JSON has neither NaN nor infinity."""
+    if isinstance(value, dict):
+        return {key: _strict(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_strict(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def number(value: float | int | None, fmt: str) -> str:
+    """For tables."""
+    return "-" if value is None else format(value, fmt)
+
+
+def milliseconds(value: float | None) -> str:
+    """Three digits."""
+    return "-" if value is None else f"{value:.3g}" if value < 100 else f"{value:.0f}"

@@ -1,0 +1,74 @@
+"""Single precision: nothing hangs, nothing is NaN, and the manifold is met to its rounding."""
+
+import diffrax as dfx
+import jax
+import jax.flatten_util as jfu
+import jax.numpy as jnp
+import manifold_jax as mj
+import numpy as np
+import outside
+import pytest
+
+
+def single(tree):
+    return jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), tree)
+
+
+def build(name):
+    if name == "outside":
+        return (
+            outside.terms(),
+            outside.constraint(),
+            single((outside.T0, outside.T1, outside.y0(), outside.parameters())),
+        )
+    problem = mj.problems.ALL[name]()
+    problem = problem.with_args(single(problem.args)).with_initial(single(problem.y0))
+    return (
+        problem.terms,
+        problem.constraint,
+        single((problem.t0, problem.t1, problem.y0, problem.args)),
+    )
+
+
+@pytest.mark.parametrize("name", [*mj.problems.ALL, "outside"])
+def test_gallery_in_single_precision(name):
+    terms, constraint, (t0, t1, y0, args) = build(name)
+
+    def solve(y0, adjoint, saveat):
+        return mj.diffeqsolve(
+            terms,
+            mj.Projected(dfx.Tsit5(), constraint),
+            t0,
+            t1,
+            None,
+            y0,
+            args,
+            saveat=saveat,
+            stepsize_controller=dfx.PIDController(rtol=1e-4, atol=1e-4),
+            adjoint=adjoint,
+        )
+
+    ts = jnp.linspace(t0, t1, 50, dtype=jnp.float32)
+    sol = solve(y0, dfx.RecursiveCheckpointAdjoint(), dfx.SaveAt(ts=ts))
+    assert all(leaf.dtype == jnp.float32 for leaf in jax.tree.leaves(sol.ys))
+    ulp = float(jnp.finfo(jnp.float32).eps)
+    assert float(mj.constraint_violation(constraint, ts, sol.ys, args)) <= 20 * ulp
+
+    def total(y0):
+        sol = solve(y0, dfx.RecursiveCheckpointAdjoint(), dfx.SaveAt(t1=True))
+        return jnp.sum(jfu.ravel_pytree(sol.ys)[0])
+
+    gradient, _ = jfu.ravel_pytree(jax.grad(total)(y0))
+    assert gradient.dtype == jnp.float32
+    assert np.all(np.isfinite(gradient))
+
+
+def test_projection_tolerance_follows_the_type():
+    projection = mj.NewtonProjection()
+    assert projection.tolerance_for(jnp.float32) > 1e8 * projection.tolerance_for(jnp.float64)
+    p, info = mj.project(
+        mj.Constraint(lambda t, y, args: y @ y - 1.0), 0.0, jnp.array([0.7, 0.9], jnp.float32)
+    )
+    assert p.dtype == jnp.float32
+    assert bool(info.success)
+    np.testing.assert_allclose(np.sum(np.square(p)), 1, atol=3e-7)
