@@ -14,12 +14,13 @@ from typing import Annotated, Any, NamedTuple
 import diffrax as dfx
 import jax
 import jax.numpy as jnp
-import manifold_jax as mj
 import numpy as np
 import typer
-from manifold_jax.problems import Problem
 from rich.console import Console
 from rich.table import Table
+
+import manifold_jax as mj
+from manifold_jax.problems import Problem
 
 from ._measure import (
     compiled,

@@ -7,8 +7,10 @@ import jax.tree_util as jtu
 from diffrax import RESULTS
 from diffrax._heuristics import is_sde as is_sde  # which terms are driven by Brownian motion
 from diffrax._saveat import save_y as save_y  # marks "save the state itself" in SubSaveAt.fn
-from diffrax._solution import is_okay as is_okay  # successful or stopped by an event
-from diffrax._solution import update_result as update_result  # first failure wins
+from diffrax._solution import (
+    is_okay as is_okay,  # successful or stopped by an event
+    update_result as update_result,  # first failure wins
+)
 from diffrax._term import WrapTerm
 from jaxtyping import PyTree
 

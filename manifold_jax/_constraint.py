@@ -131,8 +131,11 @@ def jacobian(
 
 
 def row_scale(G: Float[Array, "m n"], x: Float[Array, " n"]) -> Float[Array, " m"]:
-    """Typical size of each residual, `max_j |G_ij| (|x_j| + 1)`: row equilibration
-    (Sudarsan & Keerthi 1998, eqs. (3.3)-(3.4), with typical sizes taken from the state)."""
+    """Typical size of each residual, `max_j |G_ij| (|x_j| + 1)`.
+
+    This is row equilibration (Sudarsan & Keerthi 1998, eqs. (3.3)-(3.4), with the typical
+    sizes taken from the state).
+    """
     scale = jnp.max(jnp.abs(G) * (jnp.abs(x) + 1)[None, :], axis=1)
     return jnp.maximum(scale, jnp.finfo(G.dtype).tiny)
 
@@ -141,7 +144,9 @@ def check_state(y: Y, name: str = "y0") -> None:
     """Refuse, while tracing, states that are not pytrees of real floating-point arrays."""
     leaves = jtu.tree_leaves(y)
     if len(leaves) == 0:
-        raise ValueError(f"`{name}` has no array leaves: pass the state as a pytree of real arrays.")
+        raise ValueError(
+            f"`{name}` has no array leaves: pass the state as a pytree of real arrays."
+        )
     for leaf in leaves:
         if not eqx.is_array_like(leaf):
             raise TypeError(
@@ -183,7 +188,9 @@ def check_constraint(constraint: AbstractConstraint, t: RealScalarLike, y: Y, ar
     m = sum(leaf.size if isinstance(leaf, jax.ShapeDtypeStruct) else 1 for leaf in leaves)
     n = sum(jnp.size(leaf) for leaf in jtu.tree_leaves(y))
     if m == 0:
-        raise ValueError("`constraint` returned an empty residual; without constraints use the solver alone.")
+        raise ValueError(
+            "`constraint` returned an empty residual; without constraints use the solver alone."
+        )
     if m > n:
         raise ValueError(
             f"`constraint` returned {m} residuals for a state of {n} numbers; at most {n} independent "

@@ -21,7 +21,7 @@ _MESSAGES = (
     "others (redundant), or `y0` is a singular point. Remove dependent equations, or start elsewhere.",
     "`y0` could not be made consistent with `constraint`: no nearby state satisfies g(t0, y, args) = 0. Start "
     "closer to the manifold, or check that the equations can hold at the same time.",
-    "`y0` is not on the manifold. Write `consistent=\"project\"` to have it moved there, or correct it first with "
+    '`y0` is not on the manifold. Write `consistent="project"` to have it moved there, or correct it first with '
     "`mj.consistent_state`.",
 )
 
@@ -69,8 +69,10 @@ def consistent_state(
 
 
 class StartInfo(eqx.Module):
-    """How an initial value was treated: the change made, whether it can be used, and if
-    not, which of `_MESSAGES` applies."""
+    """How an initial value was treated.
+
+    The change made, whether the value can be used, and if not, which of `_MESSAGES` applies.
+    """
 
     correction: FloatScalar
     success: BoolScalar

@@ -1,7 +1,6 @@
 """Dense output: interpolants that end where the corrected steps do, and stay on the manifold."""
 
 from collections.abc import Callable
-from typing import Any
 
 import diffrax as dfx
 import equinox as eqx
@@ -28,7 +27,9 @@ class CorrectedInterpolation(dfx.AbstractLocalInterpolation):
     y1: Y
     correction: Y
 
-    def evaluate(self, t0: RealScalarLike, t1: RealScalarLike | None = None, left: bool = True) -> Y:
+    def evaluate(
+        self, t0: RealScalarLike, t1: RealScalarLike | None = None, left: bool = True
+    ) -> Y:
         if t1 is not None:
             return jtu.tree_map(jnp.subtract, self.evaluate(t1), self.evaluate(t0))
         value = self.inner.evaluate(t0, left=left)
@@ -53,7 +54,11 @@ class CorrectedInterpolationFactory(eqx.Module):
 
     def __call__(self, *, t0, t1, corrected, correction, **info) -> CorrectedInterpolation:
         return CorrectedInterpolation(
-            t0=t0, t1=t1, inner=self.inner(t0=t0, t1=t1, **info), y1=corrected, correction=correction
+            t0=t0,
+            t1=t1,
+            inner=self.inner(t0=t0, t1=t1, **info),
+            y1=corrected,
+            correction=correction,
         )
 
 
@@ -77,10 +82,16 @@ class ManifoldInterpolation(dfx.AbstractPath):
     def t1(self):  # pyright: ignore
         return self.inner.t1
 
-    def evaluate(self, t0: RealScalarLike, t1: RealScalarLike | None = None, left: bool = True) -> Y:
+    def evaluate(
+        self, t0: RealScalarLike, t1: RealScalarLike | None = None, left: bool = True
+    ) -> Y:
         if t1 is not None:
-            return jtu.tree_map(jnp.subtract, self.evaluate(t1, left=left), self.evaluate(t0, left=left))
-        y, info = self.projection(self.constraint, t0, self.inner.evaluate(t0, left=left), self.args)
+            return jtu.tree_map(
+                jnp.subtract, self.evaluate(t1, left=left), self.evaluate(t0, left=left)
+            )
+        y, info = self.projection(
+            self.constraint, t0, self.inner.evaluate(t0, left=left), self.args
+        )
         return jtu.tree_map(lambda leaf: jnp.where(info.success, leaf, jnp.nan), y)
 
     def derivative(self, t: RealScalarLike, left: bool = True) -> Y:

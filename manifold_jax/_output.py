@@ -11,7 +11,7 @@ import jax.tree_util as jtu
 from jaxtyping import Array
 
 from ._compat import save_y
-from ._custom_types import Args, BoolScalar, RealScalarLike, Y
+from ._custom_types import Args, BoolScalar, Y
 from ._solver.base import AbstractManifoldSolver
 
 
@@ -114,7 +114,9 @@ def _corrected(
     """
     used = jnp.isfinite(t)
     y = jtu.tree_map(lambda a, b: jnp.where(used, a, b), y, y0)
-    corrected, info = solver.projection(solver.constraint, jnp.where(used, t, jnp.zeros_like(t)), y, args)
+    corrected, info = solver.projection(
+        solver.constraint, jnp.where(used, t, jnp.zeros_like(t)), y, args
+    )
     missing = jnp.where(used, jnp.nan, jnp.inf)
     valid = used & info.success
     out = jtu.tree_map(lambda a: jnp.where(valid, a, missing.astype(a.dtype)), corrected)

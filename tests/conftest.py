@@ -4,9 +4,9 @@ import os
 # The tests check numbers, not speed: compile twice as fast. Has to be set before JAX starts.
 os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0")
 
-import jax  # noqa: E402
-import jaxtyping  # noqa: E402
-import pytest  # noqa: E402
+import jax
+import jaxtyping
+import pytest
 
 
 jax.config.update("jax_enable_x64", True)

@@ -10,8 +10,9 @@ from typing import NamedTuple
 import diffrax as dfx
 import jax
 import jax.numpy as jnp
-import manifold_jax as mj
 import numpy as np
+
+import manifold_jax as mj
 
 
 OMEGA = np.array([0.4, -1.1, 0.7])

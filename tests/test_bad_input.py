@@ -3,9 +3,10 @@
 import diffrax as dfx
 import jax
 import jax.numpy as jnp
-import manifold_jax as mj
 import numpy as np
 import pytest
+
+import manifold_jax as mj
 
 
 CIRCLE = mj.Constraint(lambda t, y, args: y @ y - 1.0)

@@ -3,8 +3,9 @@
 import diffrax as dfx
 import jax
 import jax.numpy as jnp
-import manifold_jax as mj
 import numpy as np
+
+import manifold_jax as mj
 
 
 def test_violation_is_scaled_by_rows():
@@ -13,9 +14,7 @@ def test_violation_is_scaled_by_rows():
     y = jnp.array([1.001, 3.0])
     # Rows: 1e3 / (1e6 * 2.001) and (3 - 2.5) / 4.
     assert np.isclose(mj.constraint_violation(constraint, 2.5, y), 0.125)
-    assert np.isclose(
-        mj.constraint_violation(constraint, 3.0, y), 1e3 / (1e6 * 2.001), rtol=1e-12
-    )
+    assert np.isclose(mj.constraint_violation(constraint, 3.0, y), 1e3 / (1e6 * 2.001), rtol=1e-12)
 
 
 def test_violation_of_a_trajectory_skips_unused_entries():

@@ -4,10 +4,11 @@ import diffrax as dfx
 import jax
 import jax.flatten_util as jfu
 import jax.numpy as jnp
-import manifold_jax as mj
 import numpy as np
 import outside
 import pytest
+
+import manifold_jax as mj
 
 
 def single(tree):
@@ -22,7 +23,9 @@ def build(name):
             single((outside.T0, outside.T1, outside.y0(), outside.parameters())),
         )
     problem = mj.problems.ALL[name]()
-    problem = problem.with_args(single(problem.args)).with_initial(single(problem.y0))
+    with jax.numpy_dtype_promotion("standard"):  # the start is still in double precision here
+        problem = problem.with_args(single(problem.args))
+    problem = problem.with_initial(single(problem.y0))
     return (
         problem.terms,
         problem.constraint,

@@ -10,12 +10,13 @@ import diffrax as dfx
 import jax
 import jax.flatten_util as jfu
 import jax.numpy as jnp
-import manifold_jax as mj
 import numpy as np
 import numpy_residuals
 import optimistix as optx
 import outside
 import pytest
+
+import manifold_jax as mj
 
 
 TOLERANCE = 1e-8
@@ -39,9 +40,17 @@ class Case:
 
     def __init__(self, name):
         if name == "outside":
-            self.terms, self.constraint, self.y0 = outside.terms(), outside.constraint(), outside.y0()
+            self.terms, self.constraint, self.y0 = (
+                outside.terms(),
+                outside.constraint(),
+                outside.y0(),
+            )
             self.t0, self.t1, self.args = outside.T0, outside.T1, outside.parameters()
-            self.residual, self.reference, self.end_only = outside.residual_numpy, outside.exact, False
+            self.residual, self.reference, self.end_only = (
+                outside.residual_numpy,
+                outside.exact,
+                False,
+            )
         else:
             problem = mj.problems.ALL[name]()
             self.terms, self.constraint, self.y0 = problem.terms, problem.constraint, problem.y0
@@ -120,11 +129,15 @@ def test_on_the_manifold_and_accurate(case, solver):
     first = -1 if case.end_only else 0
     compared, values = ts[first:], jax.tree.map(lambda leaf: leaf[first:], sol.ys["ts"])
     reference = case.reference(np.asarray(compared))
-    errors = jax.tree.map(lambda a, b: np.abs(np.asarray(a) - b) / (1 + np.abs(b)), values, reference)
+    errors = jax.tree.map(
+        lambda a, b: np.abs(np.asarray(a) - b) / (1 + np.abs(b)), values, reference
+    )
     worst = max(error.max() for error in jax.tree.leaves(errors)) / TOLERANCE
     steps = int(sol.stats["num_accepted_steps"])
     violation = case.violation(sol.ts["ts"], sol.ys["ts"])
-    print(f"{solver:9s} steps {steps:6d}  violation {violation:.1e}  error / tol (1 + |y|) {worst:8.2f}")
+    print(
+        f"{solver:9s} steps {steps:6d}  violation {violation:.1e}  error / tol (1 + |y|) {worst:8.2f}"
+    )
     assert worst <= ALLOWED[solver]
 
 

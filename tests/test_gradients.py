@@ -5,10 +5,11 @@ import equinox as eqx
 import jax
 import jax.flatten_util as jfu
 import jax.numpy as jnp
-import manifold_jax as mj
 import numpy as np
 import outside
 import pytest
+
+import manifold_jax as mj
 
 
 ADJOINTS = {
@@ -38,9 +39,7 @@ def pendulum_end(theta, adjoint, where, controller, saveat=None):
     tangent = jnp.stack([jnp.cos(angle), jnp.sin(angle)])
     y0 = (length * direction, length * rate * tangent)
     if where == "args":
-        constraint = mj.Constraint(
-            lambda t, y, a: (y[0] @ y[0] - a[1] ** 2, y[0] @ y[1])
-        )
+        constraint = mj.Constraint(lambda t, y, a: (y[0] @ y[0] - a[1] ** 2, y[0] @ y[1]))
     elif where == "leaf":
         constraint = mj.Constraint(Circle(length))
     else:
@@ -91,9 +90,7 @@ def differences(f, x, step):
 
 @pytest.mark.parametrize("where", ["args", "leaf", "closure"])
 def test_modes_agree_and_equal_differences(where):
-    reverse = jax.jit(jax.grad(objective), static_argnums=(1, 2))(
-        THETA, ADJOINTS["reverse"], where
-    )
+    reverse = jax.jit(jax.grad(objective), static_argnums=(1, 2))(THETA, ADJOINTS["reverse"], where)
     direct = jax.jit(jax.grad(objective), static_argnums=(1, 2))(THETA, ADJOINTS["direct"], where)
     forward = jax.jit(jax.jacfwd(objective), static_argnums=(1, 2))(
         THETA, ADJOINTS["forward"], where

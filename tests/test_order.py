@@ -7,11 +7,11 @@ the leading error term raise the order there.
 import diffrax as dfx
 import jax
 import jax.flatten_util as jfu
-import jax.numpy as jnp
-import manifold_jax as mj
 import numpy as np
 import optimistix as optx
 import pytest
+
+import manifold_jax as mj
 
 
 # The implicit stages are solved to round-off, so that their error does not show.

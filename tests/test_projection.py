@@ -3,10 +3,11 @@
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import manifold_jax as mj
 import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
+
+import manifold_jax as mj
 
 
 CIRCLE = mj.Constraint(lambda t, y, args: y @ y - 1.0)

@@ -3,10 +3,11 @@
 import diffrax as dfx
 import jax
 import jax.numpy as jnp
-import manifold_jax as mj
 import numpy as np
 import optimistix as optx
 import pytest
+
+import manifold_jax as mj
 
 
 SPHERE = mj.Constraint(lambda t, y, args: y @ y - 1.0)
@@ -78,7 +79,9 @@ def test_constant_steps(solver):
     np.testing.assert_allclose(sol.ys[-1], reference(1.0), atol=1e-2)
 
 
-@pytest.mark.parametrize("solver", [dfx.Tsit5(), dfx.HalfSolver(dfx.Heun()), *IMPLICIT[1:]], ids=name)
+@pytest.mark.parametrize(
+    "solver", [dfx.Tsit5(), dfx.HalfSolver(dfx.Heun()), *IMPLICIT[1:]], ids=name
+)
 def test_adaptive_steps(solver):
     if isinstance(solver, dfx.Kvaerno3 | dfx.Kvaerno4 | dfx.Kvaerno5):
         solver = type(solver)()  # tolerances of the stages from the controller

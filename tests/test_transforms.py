@@ -4,10 +4,11 @@ import diffrax as dfx
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import manifold_jax as mj
 import numpy as np
 import outside
 import pytest
+
+import manifold_jax as mj
 
 
 def pendulum_field(t, y, gravity):

@@ -4,10 +4,11 @@ import diffrax as dfx
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import manifold_jax as mj
 import numpy as np
 import optimistix as optx
 import pytest
+
+import manifold_jax as mj
 
 
 CIRCLE = mj.Constraint(lambda t, y, args: y @ y - 1.0)
@@ -101,9 +102,7 @@ def test_events_between_steps(solver, root_finder):
     )
     projected = mj.Projected(solver, CIRCLE)
     for angle in crossings:
-        sol = mj.diffeqsolve(
-            TURN, projected, 0.0, 4.0, 0.9, START, jnp.asarray(angle), event=event
-        )
+        sol = mj.diffeqsolve(TURN, projected, 0.0, 4.0, 0.9, START, jnp.asarray(angle), event=event)
         assert sol.result == dfx.RESULTS.event_occurred
         np.testing.assert_allclose(sol.ts[0], angle, atol=5e-3)
         np.testing.assert_allclose(sol.ys[0], [np.cos(angle), np.sin(angle)], atol=1e-9)
@@ -113,9 +112,7 @@ def test_events_see_true_time_backwards():
     seen = dfx.Event(
         lambda t, y, args, *, t0, t1, **kwargs: t - 0.7 + 0 * (t0 - t1), optx.Newton(1e-12, 1e-12)
     )
-    sol = mj.diffeqsolve(
-        TURN, mj.Projected(dfx.Tsit5(), CIRCLE), 2.0, 0.0, -0.1, START, event=seen
-    )
+    sol = mj.diffeqsolve(TURN, mj.Projected(dfx.Tsit5(), CIRCLE), 2.0, 0.0, -0.1, START, event=seen)
     np.testing.assert_allclose(sol.ts[0], 0.7, atol=1e-12)
 
 

@@ -56,7 +56,7 @@ def explicit_step(
     f, increments = f0, [terms.prod(f0, control)]
     fsal = is_first_same_as_last(tableau)
     y = y0
-    for i, (row, c) in enumerate(zip(tableau.a_lower, tableau.c)):
+    for i, (row, c) in enumerate(zip(tableau.a_lower, tableau.c, strict=True)):
         y = _combine(row, increments, y0)
         if fsal and i == last:
             raw, (y, info) = y, correct(y)
@@ -74,8 +74,10 @@ def explicit_step(
 
 def _combine(weights: Any, increments: list[Y], start: Y | None = None) -> Y:
     """`start + sum_i weights_i increments_i`, without the terms whose weight is zero."""
-    used = [(float(w), k) for w, k in zip(weights, increments) if w != 0]
-    total = jtu.tree_map(lambda *ks: sum(w * k for (w, _), k in zip(used, ks)), *(k for _, k in used))
+    used = [(float(w), k) for w, k in zip(weights, increments, strict=True) if w != 0]
+    total = jtu.tree_map(
+        lambda *ks: sum(w * k for (w, _), k in zip(used, ks, strict=True)), *(k for _, k in used)
+    )
     return total if start is None else jtu.tree_map(jnp.add, start, total)
 
 

@@ -32,7 +32,9 @@ class ProjectionStatistics(eqx.Module):
     def including(self, info: ProjectionInfo) -> "ProjectionStatistics":
         return ProjectionStatistics(
             self.iterations + info.iterations,
-            jnp.maximum(self.largest_correction, info.correction.astype(self.largest_correction.dtype)),
+            jnp.maximum(
+                self.largest_correction, info.correction.astype(self.largest_correction.dtype)
+            ),
         )
 
 
@@ -101,7 +103,9 @@ class Projected(AbstractManifoldSolver):
     def interpolation_cls(self):  # pyright: ignore
         return CorrectedInterpolationFactory(self.inner.interpolation_cls)
 
-    def init(self, terms, t0: RealScalarLike, t1: RealScalarLike, y0: Y, args: Args) -> ProjectedState:
+    def init(
+        self, terms, t0: RealScalarLike, t1: RealScalarLike, y0: Y, args: Args
+    ) -> ProjectedState:
         check_noise(self.solver, terms)
         check_constraint(self.constraint, t0, y0, args)
         if is_unrollable(self.inner, terms, t0, t1, y0, args):

@@ -1,0 +1,39 @@
+"""The README's example runs and does what the text says."""
+
+import re
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+
+README = Path(__file__).parents[1] / "README.md"
+
+
+@pytest.fixture
+def example():
+    blocks = re.findall(r"```python\n(.*?)```", README.read_text(), flags=re.DOTALL)
+    assert blocks
+    return blocks[0]
+
+
+def test_example_runs_and_keeps_the_manifold(example):
+    with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
+        namespace = {}
+        exec(compile(example, str(README), "exec"), namespace)
+    q, v = namespace["sol"].ys
+    assert np.abs(np.sum(np.square(q), axis=-1) - 1).max() <= 1e-15
+    assert np.abs(np.sum(q * v, axis=-1)).max() <= 2e-15
+    # d x(10) / d g, exact to the digits given.
+    assert abs(namespace["slope"] + 2.12823553) <= 1e-5
+
+
+def test_example_is_short(example):
+    assert len([line for line in example.splitlines() if line.strip()]) <= 20
+
+
+def test_commands_are_there():
+    text = README.read_text()
+    assert "manifold-jax compare pendulum" in text
+    assert re.search(r"<!-- test command -->\n```bash\n.*pytest.*\n```", text)
