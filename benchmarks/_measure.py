@@ -14,6 +14,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from rich.console import Console
 
 
 # What a result depends on, in every JSON file.
@@ -150,3 +151,9 @@ def number(value: float | int | None, fmt: str) -> str:
 def milliseconds(value: float | None) -> str:
     """Three digits."""
     return "-" if value is None else f"{value:.3g}" if value < 100 else f"{value:.0f}"
+
+
+def make_console() -> Console:
+    """Wide enough for the tables where the output is not a terminal."""
+    console = Console()
+    return console if console.is_terminal else Console(width=150)

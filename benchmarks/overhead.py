@@ -16,7 +16,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import typer
-from rich.console import Console
 from rich.table import Table
 
 import manifold_jax as mj
@@ -28,10 +27,12 @@ from ._measure import (
     environment,
     interleaved,
     largest_difference,
+    make_console,
     median_compile_times,
     milliseconds,
     number,
     pendulum_violations,
+    Timing,
     use_double_precision,
     write_json,
 )
@@ -152,21 +153,25 @@ def measure(
     rows = []
     for name, result in results.items():
         gradient, outcome = (None, result) if exact_gradient is None else result
-        states = np.concatenate([np.asarray(leaf) for leaf in outcome.ys], axis=-1)
-        accepted, rejected = np.asarray(outcome.accepted), np.asarray(outcome.rejected)
-        row = Row(
-            group,
-            name,
-            **dataclasses.asdict(timings[name]),
-            accepted=float(np.mean(accepted)),
-            rejected=float(np.mean(rejected)),
-            violation=max(pendulum_violations(states)),
-            error=largest_difference(states, reference),
-            us_per_step=1e3 * timings[name].median_ms / float(np.sum(accepted + rejected)),
-            gradient_error=None if gradient is None else abs(float(gradient) - exact_gradient),
-        )
-        rows.append(row)
+        error = None if gradient is None else abs(float(gradient) - exact_gradient)
+        row = _row(group, name, timings[name], outcome, reference)
+        rows.append(dataclasses.replace(row, gradient_error=error))
     return rows
+
+
+def _row(group: str, variant: str, timing: Timing, outcome: Outcome, reference: np.ndarray) -> Row:
+    states = np.concatenate([np.asarray(leaf) for leaf in outcome.ys], axis=-1)
+    accepted, rejected = np.asarray(outcome.accepted), np.asarray(outcome.rejected)
+    return Row(
+        group,
+        variant,
+        **dataclasses.asdict(timing),
+        accepted=float(np.mean(accepted)),
+        rejected=float(np.mean(rejected)),
+        violation=max(pendulum_violations(states)),
+        error=largest_difference(states, reference),
+        us_per_step=1e3 * timing.median_ms / float(np.sum(accepted + rejected)),
+    )
 
 
 def reference_states(problem: Problem, times: Any) -> np.ndarray:
@@ -375,12 +380,12 @@ def main(
     json: Annotated[Path | None, typer.Option(metavar="FILE", help="Write results here.")] = None,
     batch: Annotated[int, typer.Option(min=1, help="Trajectories in the batch.")] = 1000,
     repeats: Annotated[int, typer.Option(min=1, help="Timed runs of every program.")] = 101,
-    compile_repeats: Annotated[int, typer.Option(min=1, help="Timed compilations of each.")] = 9,
+    compile_repeats: Annotated[int, typer.Option(min=1, help="Timed compilations of each.")] = 5,
 ) -> None:
     """Measure what projection costs in time, and compare with the goals."""
     use_double_precision()
     problem = mj.problems.pendulum()
-    console = Console()
+    console = make_console()
     with console.status("measuring"):
         single = single_trajectory(problem, repeats)
         many = batch_of_trajectories(problem, batch, repeats)

@@ -95,7 +95,7 @@ def _chord(
 ) -> _Iterate:
     """Simplified Newton: one factorization throughout. Two iterations are nearly always
     enough, and are written out so that they fuse with the step around them."""
-    z = jnp.zeros_like(r)
+    z, level = jnp.zeros_like(r), equations.level(r)
     for _ in range(min(2, max_steps)):
         z = z - factorization.solve(r)
         r, level = equations.at(z)

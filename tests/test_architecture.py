@@ -33,6 +33,8 @@ LAYERS = [
 
 def layer_of(module):
     head = module.split(".")[0] or "__init__"
+    if not (PACKAGE / head).is_dir() and not (PACKAGE / f"{head}.py").is_file():
+        head = "__init__"  # a name that the package itself defines
     return next(i for i, layer in enumerate(LAYERS) if head in layer)
 
 
@@ -90,6 +92,9 @@ def test_importing_changes_nothing_in_jax():
 
 
 def test_every_public_name_has_a_docstring():
-    for name in dir(mj):
-        if not name.startswith("_") and name != "problems":
-            assert (getattr(mj, name).__doc__ or "").strip(), name
+    public = [
+        x for x in vars(mj).values() if getattr(x, "__module__", "").startswith("manifold_jax")
+    ]
+    assert len(public) >= 9
+    for x in public:
+        assert (x.__doc__ or "").strip(), x

@@ -8,6 +8,7 @@ import equinox as eqx
 from .._compat import is_sde
 from .._constraint import AbstractConstraint
 from .._custom_types import Args, RealScalarLike, Y
+from .._projection import NewtonProjection
 
 
 # One-step methods that keep no past values of y. Others (leapfrog, reversible) carry a
@@ -33,9 +34,10 @@ class AbstractManifoldSolver(dfx.AbstractWrappedSolver):
 
     inner: eqx.AbstractVar[dfx.AbstractSolver]
     constraint: eqx.AbstractVar[AbstractConstraint]
+    projection: eqx.AbstractVar[NewtonProjection]  # also corrects what is handed out
 
     @property
-    def solver(self) -> dfx.AbstractSolver:
+    def solver(self) -> dfx.AbstractSolver:  # pyright: ignore
         return self.inner.solver if isinstance(self.inner, dfx.HalfSolver) else self.inner
 
     @property
@@ -49,16 +51,16 @@ class AbstractManifoldSolver(dfx.AbstractWrappedSolver):
     # Read, and replaced through `eqx.tree_at`, when the innermost solver is implicit.
     @property
     def root_finder(self):
-        return self.solver.root_finder
+        return self.solver.root_finder  # pyright: ignore
 
     @property
     def root_find_max_steps(self):
-        return self.solver.root_find_max_steps
+        return self.solver.root_find_max_steps  # pyright: ignore
 
     # Set by forward-mode adjoints on Runge-Kutta methods.
     @property
     def scan_kind(self):
-        return self.solver.scan_kind
+        return self.solver.scan_kind  # pyright: ignore
 
     def order(self, terms) -> int | None:
         return self.inner.order(terms)

@@ -52,24 +52,22 @@ def explicit_step(
     """
     control = terms.contr(t0, t1)
     vf = jax.jit(lambda t, y: terms.vf(t, y, args))  # traced once, not once per stage
-    last = len(tableau.a_lower) - 1
-    f, increments = f0, [terms.prod(f0, control)]
     fsal = is_first_same_as_last(tableau)
-    y = y0
-    for i, (row, c) in enumerate(zip(tableau.a_lower, tableau.c, strict=True)):
+    rows, nodes = list(tableau.a_lower), [float(c) for c in tableau.c]
+    f, increments = f0, [terms.prod(f0, control)]
+    for row, c in zip(rows[:-1] if fsal else rows, nodes, strict=False):
         y = _combine(row, increments, y0)
-        if fsal and i == last:
-            raw, (y, info) = y, correct(y)
-        # The last node of most methods is exactly 1; `t0 + 1 (t1 - t0)` may not be `t1`.
-        t = jnp.asarray(t1 if c == 1 else t0 + float(c) * (t1 - t0))
-        f = vf(t, y)
+        f = vf(jnp.asarray(t0 + c * (t1 - t0)), y)
         increments.append(terms.prod(f, control))
-    if not fsal:
-        raw = _combine(tableau.b_sol, increments, y0)
-        y, info = correct(raw)
+    # The last stage of a first-same-as-last method is taken at the new state itself.
+    raw = _combine(rows[-1] if fsal else tableau.b_sol, increments, y0)
+    y1, info = correct(raw)
+    if fsal:
+        f = vf(jnp.asarray(t1), y1)
+        increments.append(terms.prod(f, control))
     error = _combine(tableau.b_error, increments)
     k = jtu.tree_map(lambda *ks: jnp.stack(ks), *increments)
-    return y, raw, error, dict(y0=y0, y1=raw, k=k), f, info
+    return y1, raw, error, dict(y0=y0, y1=raw, k=k), f, info
 
 
 def _combine(weights: Any, increments: list[Y], start: Y | None = None) -> Y:

@@ -109,7 +109,7 @@ class Projected(AbstractManifoldSolver):
         check_noise(self.solver, terms)
         check_constraint(self.constraint, t0, y0, args)
         if is_unrollable(self.inner, terms, t0, t1, y0, args):
-            fsal = is_first_same_as_last(self.inner.tableau)
+            fsal = is_first_same_as_last(self.inner.tableau)  # pyright: ignore
             inner_state = terms.vf(t0, y0, args) if fsal else None
         else:
             inner_state = self.inner.init(terms, t0, t1, y0, args)
@@ -131,7 +131,7 @@ class Projected(AbstractManifoldSolver):
             return self.projection(self.constraint, time, y, args, fallback=y0)
 
         if is_unrollable(self.inner, terms, t0, t1, y0, args):
-            tableau = self.inner.tableau
+            tableau = self.inner.tableau  # pyright: ignore
             fsal = is_first_same_as_last(tableau)
             evaluate = lambda: terms.vf(t0, y0, args)
             f0 = refreshed(made_jump, solver_state.inner, evaluate) if fsal else evaluate()
