@@ -17,6 +17,8 @@ import numpy as np
 from rich.console import Console
 
 
+# Seconds of untimed runs before each timed one; at least one run.
+WARM_UP = 0.005
 # What a result depends on, in every JSON file.
 PACKAGES = ("manifold_jax", "jax", "jaxlib", "diffrax", "equinox", "numpy", "scipy")
 
@@ -33,18 +35,27 @@ class Timing:
 def interleaved(runs: Mapping[str, Callable[[], Any]], repeats: int) -> dict[str, Timing]:
     """Time programs in turn, so that a disturbance of the machine meets all of them alike.
 
-    Every round starts with another one: each is as often first and after each other. Programs
-    have to block until they are done, and must have been run before.
+    Every round starts with another one. A timed run follows untimed ones of the same program:
+    else a short program would be charged for what the long one before it has driven from the
+    caches (measured: a factor of two to three). Programs have to block until they are done.
     """
     names = list(runs)
     durations: dict[str, list[float]] = {name: [] for name in names}
     for k in range(repeats):
         shift = k % len(names)
         for name in names[shift:] + names[:shift]:
+            _warm_up(runs[name])
             start = time.perf_counter()
             runs[name]()
             durations[name].append(1e3 * (time.perf_counter() - start))
     return {name: _timing(values) for name, values in durations.items()}
+
+
+def _warm_up(run: Callable[[], Any]) -> None:
+    end = time.perf_counter() + WARM_UP
+    run()
+    while time.perf_counter() < end:
+        run()
 
 
 def _timing(values: list[float]) -> Timing:

@@ -48,6 +48,8 @@ T1 = 10.0
 GRID = np.linspace(0.0, T1, 1001)
 TOLERANCES = (1e-6, 1e-8, 1e-10)
 MAX_STEPS = 100_000
+# A violation of exactly zero is drawn here.
+FLOOR = 1e-17
 # The optional libraries: name of the module, name of the package.
 PEERS = {"casadi": "casadi", "pydiffsol": "pydiffsol", "sksundae": "scikit-sundae"}
 
@@ -438,21 +440,28 @@ def write_figure(path: Path, methods: list[Method], rows: list[Row]) -> None:
         if solved:
             lines.append(_draw(left, method, solved, [row.error for row in solved]))
             _draw(right, method, solved, [_violation(row) for row in solved])
-    left.set(title="error of the state", ylabel="largest error of a component")
-    right.set(title="violation of the constraints", ylabel="max $|x^2+y^2-1|$, $|xu+yv|$")
+    left.set(title="error of the state", ylabel="largest error of a component, on the grid")
+    right.set(
+        title="violation of the constraints",
+        ylabel="largest of $|x^2+y^2-1|$ and $|xu+yv|$, on the grid",
+    )
     for axes in (left, right):
         axes.set(xlabel="run time (ms)", xscale="log", yscale="log")
         axes.grid(alpha=0.3)
-    figure.legend(handles=lines, loc="outside lower center", ncols=3, frameon=False)
+    right.set_ylim(bottom=FLOOR)
+    figure.legend(handles=lines, loc="outside lower center", ncols=4, frameon=False, fontsize=9)
     tolerances = sorted({row.tolerance for row in rows}, reverse=True)
-    labels = ", ".join(f"{tolerance:.0e}" for tolerance in tolerances)
-    figure.suptitle(f"Pendulum in Cartesian coordinates, 1001 output points, tolerances {labels}")
+    labels = ", ".join(f"$10^{{{round(np.log10(tolerance))}}}$" for tolerance in tolerances)
+    figure.suptitle(
+        f"Pendulum in Cartesian coordinates, {T1:g} s, {len(GRID)} output points, "
+        f"rtol = atol = {labels} (from left to right)"
+    )
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=150)
 
 
 def _violation(row: Row) -> float:
-    return max(row.position_violation or 0.0, row.velocity_violation or 0.0)
+    return max(row.position_violation or 0.0, row.velocity_violation or 0.0, FLOOR)
 
 
 def _draw(axes: Axes, method: Method, rows: list[Row], values: list[Any]) -> Any:

@@ -72,6 +72,16 @@ def test_consistent_point_is_returned_unchanged():
     assert float(info.correction) == 0.0
 
 
+@pytest.mark.parametrize("scale", [0.01, 0.1, 0.5, 3.0, 1e3])
+def test_far_points(scale):
+    """From 0.01 the full Newton step overshoots by a factor of 50."""
+    y = scale * jnp.array([0.6, -0.8])
+    p, info = mj.project(CIRCLE, 0.0, y)
+    assert bool(info.success)
+    np.testing.assert_allclose(p, [0.6, -0.8], atol=1e-15)
+    np.testing.assert_allclose(info.correction, np.max(np.abs(p - y) / (np.abs(y) + 1)))
+
+
 def test_weights_move_the_light_components():
     constraint = mj.Constraint(lambda t, y, args: y[0] + y[1] - 1.0)
     projection = mj.NewtonProjection(metric=jnp.array([1e6, 1.0]))

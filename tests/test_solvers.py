@@ -72,11 +72,15 @@ def test_constant_steps(solver):
         1.0,
         0.02,
         START,
-        saveat=dfx.SaveAt(ts=jnp.linspace(0.0, 1.0, 23), dense=True),
+        saveat=dfx.SaveAt(
+            subs=[dfx.SubSaveAt(ts=jnp.linspace(0.0, 1.0, 23)), dfx.SubSaveAt(steps=True)],
+            dense=True,
+        ),
     )
-    assert off_sphere(sol.ys) <= 1e-15
+    assert off_sphere(sol.ys[0]) <= 1e-15
+    assert off_sphere(sol.ys[1][:50]) <= 1e-15
     assert off_sphere(sol.evaluate(0.4567)) <= 1e-15
-    np.testing.assert_allclose(sol.ys[-1], reference(1.0), atol=1e-2)
+    np.testing.assert_allclose(sol.ys[0][-1], reference(1.0), atol=1e-2)
 
 
 @pytest.mark.parametrize(
