@@ -98,6 +98,8 @@ def diffeqsolve(
     t0, t1 = jnp.asarray(t0, time_dtype), jnp.asarray(t1, time_dtype)
     check_constraint(solver.constraint, t0, y0, args)
     solver = _with_tolerances(solver, stepsize_controller)
+    if event is None:
+        solver = eqx.tree_at(lambda s: s.bend_interpolant, solver, False)
     y0, start = start_state(solver.constraint, t0, y0, args, solver.projection, consistent)
     if throw:
         y0 = raise_if_bad_start(y0, start)

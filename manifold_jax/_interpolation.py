@@ -51,14 +51,14 @@ class CorrectedInterpolationFactory(eqx.Module):
     """
 
     inner: Callable[..., dfx.AbstractLocalInterpolation] = eqx.field(static=True)
+    bend: bool = eqx.field(static=True)
 
-    def __call__(self, *, t0, t1, corrected, correction, **info) -> CorrectedInterpolation:
+    def __call__(self, *, t0, t1, corrected, correction, **info) -> dfx.AbstractLocalInterpolation:
+        inner = self.inner(t0=t0, t1=t1, **info)
+        if not self.bend:
+            return inner
         return CorrectedInterpolation(
-            t0=t0,
-            t1=t1,
-            inner=self.inner(t0=t0, t1=t1, **info),
-            y1=corrected,
-            correction=correction,
+            t0=t0, t1=t1, inner=inner, y1=corrected, correction=correction
         )
 
 

@@ -103,6 +103,10 @@ def test_check_refuses_and_assume_trusts():
     assert solve(consistent="check").result == dfx.RESULTS.successful
     sol = solve(y0=off, consistent="assume", saveat=dfx.SaveAt(t0=True, t1=True))
     assert np.array_equal(sol.ys[0], off)
+    # No step from there is small enough for the correction: it must not be tried for ever.
+    adaptive = dfx.PIDController(rtol=1e-6, atol=1e-6)
+    sol = solve(y0=off, consistent="assume", stepsize_controller=adaptive, max_steps=None)
+    np.testing.assert_allclose(sol.ys[0] @ sol.ys[0], 1, atol=1e-15)
     with pytest.raises(ValueError, match="`consistent`.*'project', 'check' or 'assume'"):
         mj._diffeqsolve._check_arguments(None, "maybe")
 

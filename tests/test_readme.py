@@ -30,7 +30,7 @@ def test_example_runs_and_keeps_the_manifold(example):
 
 
 def test_example_is_short(example):
-    assert len([line for line in example.splitlines() if line.strip()]) <= 20
+    assert len([line for line in example.splitlines() if line.strip()]) <= 16
 
 
 def test_commands_are_there():

@@ -216,6 +216,17 @@ def test_arrays_in_the_constraint_and_dense_output():
     np.testing.assert_allclose(slope, [np.cos(0.33), np.sin(0.33)], atol=1e-7)
 
 
+@pytest.mark.parametrize("solver", [dfx.Tsit5(), dfx.Dopri8(), dfx.Dopri5()])
+def test_projected_dense_output_ends_at_the_steps(solver):
+    """Correcting the raw interpolant at the end of a step gives the corrected state again."""
+    saveat = dfx.SaveAt(steps=True, dense=True)
+    sol = mj.diffeqsolve(TURN, mj.Projected(solver, CIRCLE), 0.0, 3.6, 1.2, START, saveat=saveat)
+    for t, y in zip(sol.ts[:2], sol.ys[:2]):
+        for left in (True, False):
+            np.testing.assert_allclose(sol.evaluate(t, left=left), y, rtol=0, atol=5e-14)
+        np.testing.assert_allclose(sol.evaluate(t - 1e-9), y, rtol=0, atol=5e-9)
+
+
 def test_dense_increment_has_the_sign_of_diffrax():
     sol = mj.diffeqsolve(
         TURN, mj.Projected(dfx.Tsit5(), CIRCLE), 0.0, 1.0, 0.1, START, saveat=dfx.SaveAt(dense=True)

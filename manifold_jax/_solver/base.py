@@ -35,6 +35,7 @@ class AbstractManifoldSolver(dfx.AbstractWrappedSolver):
     inner: eqx.AbstractVar[dfx.AbstractSolver]
     constraint: eqx.AbstractVar[AbstractConstraint]
     projection: eqx.AbstractVar[NewtonProjection]  # also corrects what is handed out
+    bend_interpolant: eqx.AbstractVar[bool]  # to end at the corrected state
 
     @property
     def solver(self) -> dfx.AbstractSolver:  # pyright: ignore

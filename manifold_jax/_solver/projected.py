@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 from diffrax import RESULTS
+from jaxtyping import Array
 
 from .._compat import is_okay, nonlinear_failure, time_direction, update_result
 from .._constraint import AbstractConstraint, check_constraint
@@ -39,9 +40,11 @@ class ProjectionStatistics(eqx.Module):
 
 
 class ProjectedState(eqx.Module):
-    """Carried from step to step: the wrapped solver's own state and the totals."""
+    """Carried from step to step: the wrapped solver's own state, the size of the first step
+    that was tried (the scale of time near t = 0), and the totals."""
 
     inner: Any
+    first_step: FloatScalar
     statistics: ProjectionStatistics
 
 
@@ -81,6 +84,9 @@ class Projected(AbstractManifoldSolver):
     inner: dfx.AbstractSolver
     constraint: AbstractConstraint
     projection: NewtonProjection
+    # Off where `mj.diffeqsolve` corrects every interpolated value, which makes them continuous
+    # by itself: the same correction of the same point. Bending costs more than interpolating.
+    bend_interpolant: bool
 
     def __init__(
         self,
@@ -98,10 +104,11 @@ class Projected(AbstractManifoldSolver):
         self.inner = solver
         self.constraint = constraint
         self.projection = NewtonProjection() if projection is None else projection
+        self.bend_interpolant = True
 
     @property
     def interpolation_cls(self):  # pyright: ignore
-        return CorrectedInterpolationFactory(self.inner.interpolation_cls)
+        return CorrectedInterpolationFactory(self.inner.interpolation_cls, self.bend_interpolant)
 
     def init(
         self, terms, t0: RealScalarLike, t1: RealScalarLike, y0: Y, args: Args
@@ -113,7 +120,8 @@ class Projected(AbstractManifoldSolver):
             inner_state = terms.vf(t0, y0, args) if fsal else None
         else:
             inner_state = self.inner.init(terms, t0, t1, y0, args)
-        return ProjectedState(inner_state, ProjectionStatistics.zero(y0))
+        first_step = jnp.abs(jnp.asarray(t1) - t0)
+        return ProjectedState(inner_state, first_step, ProjectionStatistics.zero(y0))
 
     def step(
         self,
@@ -151,29 +159,44 @@ class Projected(AbstractManifoldSolver):
             result, RESULTS.where(info.success, RESULTS.successful, nonlinear_failure())
         )
         if error is not None:
+            repeatable = _is_repeatable(t0, t1, solver_state.first_step)
             if self.projection.rtol is not None:
-                error = _at_least(error, raw, y1)
-            error = _rejecting(error, is_okay(result), t0, t1)
+                error = _at_least(error, raw, y1, repeatable)
+            error = _rejecting(error, is_okay(result), repeatable)
         correction = jtu.tree_map(jnp.subtract, y1, raw)
         dense_info = dict(corrected=y1, correction=correction, **dense_info)
-        state = ProjectedState(inner_state, solver_state.statistics.including(info))
+        statistics = solver_state.statistics.including(info)
+        state = ProjectedState(inner_state, solver_state.first_step, statistics)
         return y1, error, dense_info, state, result
 
 
-def _at_least(error: Y, raw: Y, y1: Y) -> Y:
-    """The correction is a lower bound of the local error (Sudarsan & Keerthi 1998, 3.4)."""
-    bound = jax.lax.stop_gradient(jtu.tree_map(lambda a, b: jnp.abs(a - b), y1, raw))
-    return jtu.tree_map(lambda e, b: jnp.maximum(jnp.abs(e), b), error, bound)
+def _is_repeatable(t0: RealScalarLike, t1: RealScalarLike, first_step: FloatScalar) -> BoolScalar:
+    """Whether a smaller step is possible at all within the precision of the time."""
+    t0, t1 = jnp.asarray(t0), jnp.asarray(t1)
+    scale = jnp.maximum(jnp.maximum(jnp.abs(t0), jnp.abs(t1)), first_step)
+    smallest = 100 * jnp.finfo(t1.dtype).eps * scale
+    return jnp.abs(t1 - t0) > smallest
 
 
-def _rejecting(error: Y, success: BoolScalar, t0: RealScalarLike, t1: RealScalarLike) -> Y:
+def _at_least(error: Y, raw: Y, y1: Y, repeatable: BoolScalar) -> Y:
+    """The correction is a lower bound of the local error (Sudarsan & Keerthi 1998, 3.4).
+
+    Unless the step started off the manifold: then no step is small enough, and the smallest
+    one is let through.
+    """
+
+    def raised(e: Array, a: Array, b: Array) -> Array:
+        bound = jax.lax.stop_gradient(jnp.abs(a - b))
+        return jnp.where(repeatable, jnp.maximum(jnp.abs(e), bound), e)
+
+    return jtu.tree_map(raised, error, y1, raw)
+
+
+def _rejecting(error: Y, success: BoolScalar, repeatable: BoolScalar) -> Y:
     """Error estimate of a step that may have failed.
 
     An infinite error makes an adaptive controller reject the step and try a smaller one.
-    At the limit of the time's precision there is none; the step is let through instead, and
-    its result code ends the solve.
+    Where there is none the step is let through, and its result code ends the solve.
     """
-    t0, t1 = jnp.asarray(t0), jnp.asarray(t1)
-    smallest = 100 * jnp.finfo(t1.dtype).eps * jnp.maximum(jnp.abs(t0), jnp.abs(t1))
-    verdict = jnp.where(jnp.abs(t1 - t0) > smallest, jnp.inf, 0.0)
+    verdict = jnp.where(repeatable, jnp.inf, 0.0)
     return jtu.tree_map(lambda e: jnp.where(success, e, verdict.astype(e.dtype)), error)
