@@ -3,6 +3,10 @@
 from importlib.metadata import version
 
 from . import problems as problems
+from ._chart import (
+    CoordinatePartitionChart as CoordinatePartitionChart,
+    TangentSpaceChart as TangentSpaceChart,
+)
 from ._constraint import (
     Constraint as Constraint,
     constraint_violation as constraint_violation,
@@ -10,12 +14,25 @@ from ._constraint import (
 )
 from ._diffeqsolve import diffeqsolve as diffeqsolve
 from ._initial import consistent_state as consistent_state
+from ._mechanics import (
+    Baumgarte as Baumgarte,
+    MechanicalSystem as MechanicalSystem,
+    VelocityStabilization as VelocityStabilization,
+)
 from ._projection import (
     NewtonProjection as NewtonProjection,
     project as project,
     ProjectionInfo as ProjectionInfo,
 )
-from ._solver import Projected as Projected
+from ._solver import (
+    LocalCoordinates as LocalCoordinates,
+    Projected as Projected,
+    Stabilized as Stabilized,
+)
+from ._stabilization import (
+    ExactStabilization as ExactStabilization,
+    InvariantStabilization as InvariantStabilization,
+)
 
 
 __version__ = version("manifold_jax")

@@ -2,7 +2,7 @@
 
 import abc
 from collections.abc import Callable
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -19,7 +19,10 @@ class AbstractConstraint(eqx.Module):
 
     Implementations provide `__call__`; everything else (Jacobian, scaling, the
     number of constraints) is derived from it by the functions of this module.
+    `redundant` says whether equations may depend on each other.
     """
+
+    redundant: eqx.AbstractVar[bool]
 
     @abc.abstractmethod
     def __call__(self, t: RealScalarLike, y: Y, args: Args = None) -> Residual:
@@ -58,6 +61,7 @@ class Constraint(AbstractConstraint):
     """
 
     function: ResidualFunction
+    redundant: ClassVar[bool] = False
 
     def __check_init__(self):
         if not callable(self.function):
@@ -98,6 +102,7 @@ class Invariants(AbstractConstraint):
 
     function: ResidualFunction
     values: Residual
+    redundant: ClassVar[bool] = False
 
     def __init__(
         self, function: ResidualFunction, *, y0: Y, t0: RealScalarLike = 0.0, args: Args = None
@@ -172,7 +177,15 @@ def check_constraint(constraint: AbstractConstraint, t: RealScalarLike, y: Y, ar
             f"`constraint` must be an `mj.Constraint`, got {type(constraint).__name__}. "
             "Wrap a residual function: `mj.Constraint(lambda t, y, args: ...)`."
         )
-    out = eqx.filter_eval_shape(constraint, t, y, args)
+    try:
+        out = eqx.filter_eval_shape(constraint, t, y, args)
+    except TypeError as error:
+        if "cond" not in str(error) and "branch" not in str(error):
+            raise
+        raise TypeError(
+            "`constraint` must return the same number of equations in every branch of `jax.lax.cond` or "
+            "`jax.lax.switch`; multiply an equation that is switched off by zero."
+        ) from error
     leaves = jtu.tree_leaves(out)
     for leaf in leaves:
         if not isinstance(leaf, jax.ShapeDtypeStruct | float):
@@ -191,7 +204,7 @@ def check_constraint(constraint: AbstractConstraint, t: RealScalarLike, y: Y, ar
         raise ValueError(
             "`constraint` returned an empty residual; without constraints use the solver alone."
         )
-    if m > n:
+    if m > n and not constraint.redundant:
         raise ValueError(
             f"`constraint` returned {m} residuals for a state of {n} numbers; at most {n} independent "
             "equations can hold. Remove dependent rows (of a symmetric matrix equation keep the upper triangle)."

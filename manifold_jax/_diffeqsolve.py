@@ -20,8 +20,11 @@ from ._initial import (
     StartInfo,
 )
 from ._interpolation import ManifoldInterpolation
+from ._mechanics.term import DirectedTerm
 from ._output import on_manifold_events, on_manifold_saving, project_output
+from ._solver import Stabilized
 from ._solver.base import AbstractManifoldSolver
+from ._stabilization import is_stable, stability_interval
 
 
 @eqx.filter_jit
@@ -88,6 +91,8 @@ def diffeqsolve(
         controller_state=controller_state,
         made_jump=made_jump,
     )
+    if throw and isinstance(stepsize_controller, dfx.ConstantStepSize) and dt0 is not None:
+        y0 = _raise_if_unstable(y0, terms, solver, dt0)
     if not isinstance(solver, AbstractManifoldSolver):
         return dfx.diffeqsolve(
             terms, solver, t0, t1, dt0, y0, args, saveat=saveat, event=event, throw=throw, **options
@@ -138,6 +143,22 @@ def _check_arguments(adjoint: Any, consistent: str) -> None:
         )
 
 
+def _raise_if_unstable(y0: Y, terms: Any, solver: dfx.AbstractSolver, dt0: RealScalarLike) -> Y:
+    """Refuse constant steps with which stabilization makes violations grow."""
+    stabilized = isinstance(solver, Stabilized)
+    if not stabilized and not isinstance(terms, DirectedTerm):
+        return y0
+    gain = solver.stabilization.gain if stabilized else terms.rate
+    inner = solver.solver if isinstance(solver, dfx.AbstractWrappedSolver) else solver
+    interval = stability_interval(inner)
+    message = (
+        f"`stabilization` has a gain with which gain * dt0 is beyond the stability interval {interval:.2f} of "
+        f"{type(inner).__name__}: violations would grow. Use a smaller gain or `dt0`, or an adaptive step size "
+        "controller."
+    )
+    return eqx.error_if(y0, ~is_stable(gain, dt0, inner), message)
+
+
 def _time_dtype(t0: Any, t1: Any, dt0: Any, saveat: dfx.SaveAt) -> Any:
     """The type in which Diffrax will hold times, and the least precision of the state."""
     subs = jtu.tree_leaves(saveat.subs, is_leaf=lambda x: isinstance(x, dfx.SubSaveAt))
@@ -168,7 +189,7 @@ def _with_tolerances(solver: AbstractManifoldSolver, controller: Any) -> Abstrac
 
 def _first_step(terms, solver, t0, t1, y0, args, controller) -> Any:
     tolerances = controller_tolerances(controller)
-    if tolerances is None or not isinstance(terms, dfx.ODETerm):
+    if tolerances is None or not isinstance(terms, dfx.ODETerm | DirectedTerm):
         return None
     return initial_step(terms, solver, t0, t1, y0, args, tolerances)
 
@@ -188,7 +209,7 @@ def _finish(
     result = update_result(sol.result, failed_output)
     result = RESULTS.where(start.success, result, nonlinear_failure())
     interpolation = sol.interpolation
-    if interpolation is not None:
+    if interpolation is not None and solver.corrects_output:
         interpolation = ManifoldInterpolation(
             interpolation, solver.constraint, solver.projection, args
         )

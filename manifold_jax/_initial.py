@@ -11,6 +11,7 @@ import jax.tree_util as jtu
 
 from ._constraint import AbstractConstraint, check_constraint, check_state, constraint_violation
 from ._custom_types import Args, BoolScalar, FloatScalar, IntScalar, RealScalarLike, Y
+from ._mechanics import MechanicalConstraint
 from ._projection import NewtonProjection, ProjectionInfo
 
 
@@ -18,11 +19,15 @@ _MESSAGES = (
     "`constraint` is not finite at the initial time and `y0`. Start from a state at which g(t0, y0, args) "
     "is defined.",
     "The Jacobian dg/dy of `constraint` does not have full rank at `y0`: an equation ignores y, depends on the "
-    "others (redundant), or `y0` is a singular point. Remove dependent equations, or start elsewhere.",
+    "others (redundant), or `y0` is a singular point. Remove dependent equations (or, for an "
+    "`mj.MechanicalSystem`, pass `redundant=True`), or start elsewhere.",
     "`y0` could not be made consistent with `constraint`: no nearby state satisfies g(t0, y, args) = 0. Start "
     "closer to the manifold, or check that the equations can hold at the same time.",
     '`y0` is not on the manifold. Write `consistent="project"` to have it moved there, or correct it first with '
     "`mj.consistent_state`.",
+    "`mass_matrix` is not symmetric at `y0`. Return `(M + M.T) / 2`, or check its formula.",
+    "`mass_matrix` is not positive definite at `y0` (a matrix may be singular, but not for motions that the "
+    "constraints allow; a scalar or a diagonal must be positive). Check its signs and that no mass is missing.",
 )
 
 
@@ -63,7 +68,8 @@ def consistent_state(
     patient = dataclasses.replace(projection, max_steps=max(50, projection.max_steps))
     consistent, info = patient(constraint, t, y, args, far=True)
     if throw:
-        start = StartInfo(info.correction, info.success, _failure_cause(info))
+        cause = _failure_cause(info, constraint, t, y, args)
+        start = StartInfo(info.correction, info.success, cause)
         consistent = raise_if_bad_start(consistent, start)
     return consistent, info
 
@@ -92,12 +98,13 @@ def start_state(
         dtype = jnp.result_type(*jtu.tree_leaves(y0))
         return y0, StartInfo(jnp.zeros((), dtype), jnp.asarray(True), jnp.asarray(0))
     moved, info = consistent_state(constraint, t0, y0, args, projection=projection, throw=False)
+    cause = _failure_cause(info, constraint, t0, y0, args)
     if consistent == "project":
-        return moved, StartInfo(info.correction, info.success, _failure_cause(info))
+        return moved, StartInfo(info.correction, info.success, cause)
     violation = constraint_violation(constraint, t0, y0, args)
     tolerance = projection.tolerance_for(violation.dtype)
     satisfied = violation <= tolerance
-    cause = jnp.where(info.success, 3, _failure_cause(info))
+    cause = jnp.where(info.success, 3, cause)
     return y0, StartInfo(jnp.zeros_like(info.correction), satisfied & info.full_rank, cause)
 
 
@@ -106,8 +113,14 @@ def raise_if_bad_start(value: Any, start: StartInfo) -> Any:
     return eqx.branched_error_if(value, ~start.success, start.cause, list(_MESSAGES))
 
 
-def _failure_cause(info: ProjectionInfo) -> IntScalar:
-    return jnp.where(jnp.isfinite(info.residual), jnp.where(info.full_rank, 2, 1), 0)
+def _failure_cause(
+    info: ProjectionInfo, constraint: AbstractConstraint, t: RealScalarLike, y: Y, args: Args
+) -> IntScalar:
+    cause = jnp.where(jnp.isfinite(info.residual), jnp.where(info.full_rank, 2, 1), 0)
+    if not isinstance(constraint, MechanicalConstraint):
+        return cause
+    symmetric, positive = constraint.check_mass(t, y, args)
+    return jnp.where(symmetric, jnp.where(positive, cause, 5), 4)
 
 
 def initial_step(
@@ -137,14 +150,15 @@ def initial_step(
     def norm(v: Y) -> FloatScalar:
         return jnp.asarray(controller.norm(jtu.tree_map(lambda a, s: a / s, v, scale)), t0.dtype)
 
-    f0 = terms.vf(t0, y0, args)
+    vector_field = lambda t, y: terms.vf_prod(t, y, args, 1.0)
+    f0 = vector_field(t0, y0)
     d0, d1 = norm(y0), norm(f0)
     small = (d0 < 1e-5) | (d1 < 1e-5)
     span = jnp.abs(t1 - t0)
     h0 = jnp.where(small, 1e-6 * span, 0.01 * d0 / jnp.where(small, 1.0, d1))
     step = direction * h0
     y1 = jtu.tree_map(lambda y, f: y + (step * f).astype(y.dtype), y0, f0)
-    f1 = terms.vf(t0 + step, y1, args)
+    f1 = vector_field(t0 + step, y1)
     rate = norm(jtu.tree_map(jnp.subtract, f1, f0)) / h0 / jnp.where(small, 1.0, d1)
     power = 1 / (order + 1)
     h1 = (0.01 / jnp.where(small, 1.0, d1)) ** power * rate ** (-order * power)

@@ -6,6 +6,7 @@ is therefore written out entry by entry; beyond that the library routine is used
 """
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import jax.scipy.linalg as jsl
 from jaxtyping import Array, Float
@@ -21,13 +22,15 @@ class Factorization(eqx.Module):
     """`A = L U` of a square matrix, with a flag that says whether its rank was full.
 
     Without pivoting when unrolled: the matrices met here are `G V` with `V` close to
-    `W^-1 G^T`, hence close to symmetric positive definite.
+    `W^-1 G^T`, or mass matrices, hence close to symmetric positive definite. Where the rank
+    is not full the solution is finite but meaningless: its derivative must not be NaN, as
+    the zero cotangent of a rejected step would turn into NaN, too.
     """
 
     lu: list[list[Float[Array, ""]]] | tuple[Float[Array, "m m"], Array]
     full_rank: BoolScalar
 
-    def solve(self, b: Float[Array, " m"]) -> Float[Array, " m"]:
+    def solve(self, b: Float[Array, "m ..."]) -> Float[Array, "m ..."]:
         if not isinstance(self.lu, list):
             return jsl.lu_solve(self.lu, b)
         m = len(self.lu)
@@ -42,8 +45,21 @@ class Factorization(eqx.Module):
         return jnp.stack(x)
 
 
-def factorize(A: Float[Array, "m m"]) -> Factorization:
-    """Factor `A`.
+class PseudoInverse(eqx.Module):
+    """`A^+`: for equations that depend on each other the solution of least norm.
+
+    Its derivative (constant rank; Golub & Pereyra 1973) is that of `jnp.linalg.pinv`.
+    """
+
+    inverse: Float[Array, "m m"]
+    full_rank: BoolScalar  # not asked for: only whether the matrix was finite
+
+    def solve(self, b: Float[Array, "m ..."]) -> Float[Array, "m ..."]:
+        return self.inverse @ b
+
+
+def factorize(A: Float[Array, "m m"], redundant: bool = False) -> Factorization | PseudoInverse:
+    """Factor `A`, symmetric positive semidefinite if `redundant`.
 
     The rank counts as full when every pivot exceeds `10 m eps` times its diagonal entry:
     for a Gram matrix `A = G W^-1 G^T` that ratio is the squared sine of the angle between
@@ -51,20 +67,31 @@ def factorize(A: Float[Array, "m m"]) -> Factorization:
     """
     m = A.shape[0]
     threshold = 10 * m * jnp.finfo(A.dtype).eps
+    if redundant:
+        finite = jnp.all(jnp.isfinite(A))
+        A = jnp.where(finite, A, jnp.eye(m, dtype=A.dtype))
+        return PseudoInverse(jnp.linalg.pinv(A, rtol=threshold, hermitian=True), finite)
     if m > UNROLL_LIMIT:
-        size = jnp.sqrt(jnp.maximum(jnp.abs(jnp.diagonal(A)), jnp.finfo(A.dtype).tiny))
-        equilibrated, _ = jsl.lu_factor(A / size[:, None] / size[None, :])
-        pivots = jnp.abs(jnp.diagonal(equilibrated))
-        return Factorization(jsl.lu_factor(A), jnp.all(pivots > threshold))
+        return _factorize_with_library(A, threshold)
     lu = [[A[i, j] for j in range(m)] for i in range(m)]
     full_rank = jnp.asarray(True)
     for k in range(m):
-        full_rank &= lu[k][k] > threshold * jnp.abs(A[k, k])
+        accepted = lu[k][k] > threshold * jnp.abs(A[k, k])
+        full_rank &= accepted
+        lu[k][k] = jnp.where(accepted, lu[k][k], 1)
         for i in range(k + 1, m):
             lu[i][k] = lu[i][k] / lu[k][k]
             for j in range(k + 1, m):
                 lu[i][j] = lu[i][j] - lu[i][k] * lu[k][j]
     return Factorization(lu, full_rank)
+
+
+def _factorize_with_library(A: Float[Array, "m m"], threshold: float) -> Factorization:
+    size = jnp.sqrt(jnp.maximum(jnp.abs(jnp.diagonal(A)), jnp.finfo(A.dtype).tiny))
+    equilibrated, _ = jsl.lu_factor(jax.lax.stop_gradient(A / size[:, None] / size[None, :]))
+    full_rank = jnp.all(jnp.abs(jnp.diagonal(equilibrated)) > threshold)
+    A = jnp.where(full_rank, A, jnp.eye(A.shape[0], dtype=A.dtype))
+    return Factorization(jsl.lu_factor(A), full_rank)
 
 
 def gram(A: Float[Array, "i n"], B: Float[Array, "k n"]) -> Float[Array, "i k"]:

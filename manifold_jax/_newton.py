@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 
 from ._constraint import jacobian, row_scale
 from ._custom_types import Args, BoolScalar, FloatScalar, IntScalar
-from ._linear import combine, Factorization, factorize, gram
+from ._linear import combine, Factorization, factorize, gram, PseudoInverse
 
 
 class CorrectionProblem(NamedTuple):
@@ -24,23 +24,31 @@ class CorrectionProblem(NamedTuple):
     t: Array
     x: Float[Array, " n"]
     args: Args
-    inverse_metric: Float[Array, " n"] | None
+    inverse_metric: Float[Array, " n"] | None = None
+    rows: Float[Array, "m n"] | None = None  # `V^T` where it does not depend on `x`
+    redundant: bool = False
 
     def g(self, x: Float[Array, " n"]) -> Float[Array, " m"]:
         return self.residual(self.t, x, self.args)
 
     def weighted(self, G: Float[Array, "m n"]) -> Float[Array, "m n"]:
-        """`V^T = G W^-1`, the directions as rows."""
+        """`V^T = G W^-1`, the directions as rows, unless they are given."""
+        if self.rows is not None:
+            return self.rows
         return G if self.inverse_metric is None else G * self.inverse_metric[None, :]
 
     def displaced(self, z: Float[Array, " m"]) -> Float[Array, " n"]:
         """`x + V z` without forming `V`."""
+        if self.rows is not None:
+            return self.x + combine(z, self.rows)
         _, pullback = jax.vjp(self.g, self.x)
         (d,) = pullback(z)
         return self.x + (d if self.inverse_metric is None else self.inverse_metric * d)
 
 
 class CorrectionRoot(NamedTuple):
+    """The corrected point, its multipliers, and how it went."""
+
     p: Float[Array, " n"]
     z: Float[Array, " m"]
     iterations: IntScalar
@@ -91,7 +99,10 @@ class _Equations(NamedTuple):
 
 
 def _chord(
-    equations: _Equations, r: Float[Array, " m"], factorization: Factorization, max_steps: int
+    equations: _Equations,
+    r: Float[Array, " m"],
+    factorization: Factorization | PseudoInverse,
+    max_steps: int,
 ) -> _Iterate:
     """Simplified Newton: one factorization throughout. Two iterations are nearly always
     enough, and are written out so that they fuse with the step around them."""
@@ -122,7 +133,8 @@ def _damped_newton(
     def advance(carry: tuple[_Iterate, FloatScalar]) -> tuple[_Iterate, FloatScalar]:
         s, damping = carry
         _, G = jacobian(equations.problem.g, equations.point(s.z))
-        dz = factorize(gram(G, equations.directions)).solve(s.r)
+        redundant = equations.problem.redundant
+        dz = factorize(gram(G, equations.directions), redundant).solve(s.r)
         s = equations.lowered(s, damping * dz)
         return s, jnp.where(s.progress, jnp.ones_like(damping), damping / 4)
 
@@ -131,15 +143,36 @@ def _damped_newton(
     return jax.lax.while_loop(unfinished, advance, (start, jnp.ones_like(level)))[0]
 
 
+class Linearization(NamedTuple):
+    """The Jacobian at the point that is corrected, and `G V`, factored."""
+
+    G: Float[Array, "m n"]
+    factorization: Factorization | PseudoInverse
+
+
+def linearize(problem: CorrectionProblem) -> Linearization:
+    _, G = jacobian(problem.g, problem.x)
+    return Linearization(G, factorize(gram(G, problem.weighted(G)), problem.redundant))
+
+
 @eqx.filter_custom_jvp
 def solve_correction(
-    problem: CorrectionProblem, safe: Float[Array, " n"], max_steps: int, tolerance: Any, far: bool
+    problem: CorrectionProblem,
+    safe: Float[Array, " n"],
+    max_steps: int,
+    tolerance: Any,
+    far: bool,
+    linearization: Linearization | None = None,
 ) -> CorrectionRoot:
+    """Solve `g(t, x + V z, args) = 0` for `z`.
+
+    The derivative of a failed correction is taken at `safe`. Corrections that share a
+    Jacobian and its factorization pass them on as `linearization`.
+    """
     del safe
-    r, G = jacobian(problem.g, problem.x)
-    directions = problem.weighted(G)
-    factorization = factorize(gram(G, directions))
-    equations = _Equations(problem, directions, row_scale(G, problem.x))
+    G, factorization = linearize(problem) if linearization is None else linearization
+    r = problem.g(problem.x)
+    equations = _Equations(problem, problem.weighted(G), row_scale(G, problem.x))
     if far:
         root = _damped_newton(equations, r, max_steps, tolerance)
     else:
@@ -156,9 +189,9 @@ def solve_correction(
 # in terms of the output root, so that the rule can itself be differentiated.
 @solve_correction.def_jvp
 def _derivative(primals, tangents):
-    problem, safe, max_steps, tolerance, far = primals
+    problem, safe, *_ = primals
     problem_dot, *_ = tangents
-    root = solve_correction(problem, safe, max_steps, tolerance, far)
+    root = solve_correction(*primals)
     # A failed projection may have met NaN. Move to a point where g is finite *before*
     # differentiating: selecting afterwards would leave 0 * NaN in reverse mode.
     problem = problem._replace(x=jnp.where(root.success, problem.x, safe))
@@ -171,7 +204,7 @@ def _derivative(primals, tangents):
     _, slope = eqx.filter_jvp(lambda q, p: q.g(p), (problem, p), (problem_dot, moved))
     directions = problem.weighted(jacobian(problem.g, problem.x)[1])
     B = gram(jacobian(problem.g, p)[1], directions)
-    dz = -factorize(B).solve(slope)
+    dz = -factorize(B, problem.redundant).solve(slope)
     p_dot = moved + combine(dz, directions)
     root_dot = CorrectionRoot(p_dot, dz, None, jnp.zeros_like(root.residual), None, None)
     return root, root_dot

@@ -35,7 +35,8 @@ def on_manifold_saving(
     """
 
     def wrap(sub: dfx.SubSaveAt) -> dfx.SubSaveAt:
-        if sub.fn is save_y or not _is_interpolated(sub, event):
+        interpolated = _is_interpolated(sub, event)
+        if sub.fn is save_y or not interpolated or not solver.corrects_output:
             return sub
 
         def fn(t, y, args):
@@ -70,7 +71,8 @@ def on_manifold_events(
     def wrap(cond_fn: Callable) -> Callable:
         def on_manifold(t, y, args, **kwargs):
             t = t * direction
-            y, _ = solver.projection(solver.constraint, t, y, args)
+            if solver.corrects_output:
+                y, _ = solver.projection(solver.constraint, t, y, args)
             kwargs = {**kwargs, "terms": terms, "t0": t0, "t1": t1, "dt0": dt0}
             return cond_fn(t, y, args, **kwargs)
 
@@ -91,6 +93,8 @@ def project_output(
 ) -> tuple[Any, BoolScalar]:
     """The saved values, corrected; and whether any of them could not be."""
     failed = jnp.asarray(False)
+    if not solver.corrects_output:
+        return ys, failed
 
     def correct(sub: dfx.SubSaveAt, ts: Array, ys: Any) -> Any:
         nonlocal failed

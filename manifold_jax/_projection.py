@@ -6,6 +6,7 @@ at the point `x` that is corrected, and `z` the root of the square system
 in the size of the correction.
 """
 
+import functools
 from typing import Any, Literal
 
 import equinox as eqx
@@ -15,9 +16,18 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, Float
 
-from ._constraint import AbstractConstraint, check_constraint, check_state, residual_vector
+from ._constraint import (
+    AbstractConstraint,
+    check_constraint,
+    check_state,
+    jacobian,
+    residual_vector,
+)
 from ._custom_types import Args, BoolScalar, FloatScalar, IntScalar, RealScalarLike, Y
-from ._newton import CorrectionProblem, solve_correction
+from ._mechanics import MechanicalConstraint
+from ._mechanics.constraint import Kinematics
+from ._newton import CorrectionProblem, CorrectionRoot, solve_correction
+from ._two_stage import correct_in_two_stages, Settings
 
 
 class ProjectionInfo(eqx.Module):
@@ -53,7 +63,8 @@ class NewtonProjection(eqx.Module):
 
     **Arguments:**
 
-    - `metric`: the norm in which the correction is orthogonal. `"identity"`; `"error"` for
+    - `metric`: the norm in which the correction is orthogonal. `None` is the identity, and
+        the mass matrix for the constraint of a [`MechanicalSystem`][]; `"identity"` in any case; `"error"` for
         the norm of the step size controller, `w_j = 1 / (atol + rtol |y_j|)^2`; or a pytree
         like `y` of positive weights `w_j`, large for components that should stay put.
     - `max_steps`: the most Newton iterations before the projection fails.
@@ -69,7 +80,7 @@ class NewtonProjection(eqx.Module):
     residual test); Eich, SIAM J. Numer. Anal. 30 (1993) 1467-1482 (coordinate projection).
     """
 
-    metric: Literal["identity", "error"] | Any = "identity"
+    metric: Literal["identity", "error"] | Any | None = None
     max_steps: int = eqx.field(static=True, default=20)
     tolerance: float | None = None
     rtol: RealScalarLike | None = None
@@ -92,17 +103,22 @@ class NewtonProjection(eqx.Module):
         *,
         fallback: Y | None = None,
         far: bool = False,
+        directions: Float[Array, "m n"] | None = None,
     ) -> tuple[Y, ProjectionInfo]:
         """Correct one point; see [`project`][] for arguments and return values.
 
         `fallback` is a state at which `g` is finite; the derivative of a failed projection
         is taken there, so that the zero cotangent of a rejected step stays zero. `far`
         is for points that are not the result of a small step: every iteration gets a new
-        Jacobian, and shorter steps while the residual does not decrease.
+        Jacobian, and shorter steps while the residual does not decrease. `directions` are the
+        rows of `V^T` to correct along, if not those at `y`, from [`correction_directions`][].
         """
-        x, unravel = jfu.ravel_pytree(y)
-        safe = x if fallback is None else jfu.ravel_pytree(fallback)[0]
         t = jnp.asarray(t)
+        fallback = y if fallback is None else fallback
+        if isinstance(constraint, MechanicalConstraint):
+            return self._correct_mechanics(constraint, t, y, args, fallback, far, directions)
+        x, unravel = jfu.ravel_pytree(y)
+        safe = jax.lax.stop_gradient(jfu.ravel_pytree(fallback)[0])
 
         def residual(t, x, args):
             return residual_vector(constraint, t, unravel(x), args)
@@ -110,16 +126,57 @@ class NewtonProjection(eqx.Module):
         # Parameters that `g` closes over become inputs, so that they are differentiated.
         residual = eqx.filter_closure_convert(residual, t, x, args)
         inverse_metric = self._inverse_metric(y, x)
-        problem = CorrectionProblem(residual, t, x, args, inverse_metric)
+        problem = CorrectionProblem(residual, t, x, args, inverse_metric, directions)
         tolerance = self.tolerance_for(x.dtype)
-        root = solve_correction(
-            problem, jax.lax.stop_gradient(safe), self.max_steps, tolerance, far
-        )
-        correction = jax.lax.stop_gradient(jnp.max(jnp.abs(root.p - x) / (jnp.abs(x) + 1)))
-        info = ProjectionInfo(
-            -root.z, root.iterations, root.residual, correction, root.full_rank, root.success
-        )
-        return unravel(root.p), info
+        root = solve_correction(problem, safe, self.max_steps, tolerance, far)
+        return unravel(root.p), _information(x, root)
+
+    def _correct_mechanics(
+        self,
+        constraint: MechanicalConstraint,
+        t: Array,
+        y: Y,
+        args: Args,
+        fallback: Y,
+        far: bool,
+        directions: Float[Array, "m n"] | None,
+    ) -> tuple[Y, ProjectionInfo]:
+        x, _ = jfu.ravel_pytree(y)
+        inverse_metric = self._inverse_metric(y, x)
+        if inverse_metric is None and self.metric == "identity":
+            inverse_metric = jnp.ones_like(x)
+        halves = None if inverse_metric is None else tuple(jnp.split(inverse_metric, 2))
+        settings = Settings(halves, directions, self.max_steps, self.tolerance_for(x.dtype), far)
+        corrected, *roots = correct_in_two_stages(constraint, t, y, args, fallback, settings)
+        return corrected, _information(x, *roots)
+
+    def correction_directions(
+        self, constraint: AbstractConstraint, t: RealScalarLike, y: Y, args: Args
+    ) -> tuple[Float[Array, "m n"], Float[Array, "m n"]]:
+        """The Jacobian at `y` and the rows of `V^T`, along which points near `y` are
+        corrected.
+
+        For mechanics with respect to the velocities only, `n` being half of the state.
+        """
+        t = jnp.asarray(t)
+        x, unravel = jfu.ravel_pytree(y)
+        inverse_metric = self._inverse_metric(y, x)
+        if not isinstance(constraint, MechanicalConstraint):
+            _, G = jacobian(lambda x: residual_vector(constraint, t, unravel(x), args), x)
+            return G, self.weighted(G, y)
+        equations = Kinematics(constraint, y)
+        q, v = equations.flat(y)
+        C, _ = equations.rows(t, q, v, args)
+        if inverse_metric is not None:
+            return C, C * jnp.split(inverse_metric, 2)[1]
+        if self.metric == "identity":
+            return C, C
+        return C, equations.mass(t, q, v, args, C).solve(C)
+
+    def weighted(self, G: Float[Array, "m n"], y: Y) -> Float[Array, "m n"]:
+        """`G W^-1`; the identity instead of a mass matrix."""
+        inverse_metric = self._inverse_metric(y, jfu.ravel_pytree(y)[0])
+        return G if inverse_metric is None else G * inverse_metric
 
     def tolerance_for(self, dtype: Any) -> RealScalarLike:
         """The largest scaled residual that counts as success."""
@@ -127,8 +184,8 @@ class NewtonProjection(eqx.Module):
 
     def _inverse_metric(self, y: Y, x: Float[Array, " n"]) -> Float[Array, " n"] | None:
         """Diagonal of `W^-1`, or `None` for the identity."""
-        if isinstance(self.metric, str):
-            if self.metric == "identity":
+        if self.metric is None or isinstance(self.metric, str):
+            if self.metric != "error":
                 return None
             if self.rtol is None or self.atol is None:
                 raise ValueError(
@@ -145,6 +202,19 @@ class NewtonProjection(eqx.Module):
             lambda w, leaf: jnp.broadcast_to(jnp.asarray(w, leaf.dtype), leaf.shape), self.metric, y
         )
         return 1 / jfu.ravel_pytree(weights)[0]
+
+
+def _information(x: Float[Array, " n"], *roots: CorrectionRoot) -> ProjectionInfo:
+    moved = jnp.concatenate([root.p for root in roots]) - x
+    correction = jnp.max(jnp.abs(moved) / (jnp.abs(x) + 1))
+    return ProjectionInfo(
+        multipliers=-jnp.concatenate([root.z for root in roots]),
+        iterations=functools.reduce(jnp.add, [root.iterations for root in roots]),
+        residual=functools.reduce(jnp.maximum, [root.residual for root in roots]),
+        correction=jax.lax.stop_gradient(correction),
+        full_rank=functools.reduce(jnp.logical_and, [root.full_rank for root in roots]),
+        success=functools.reduce(jnp.logical_and, [root.success for root in roots]),
+    )
 
 
 @eqx.filter_jit

@@ -17,8 +17,11 @@ FILES = sorted(PACKAGE.rglob("*.py"))
 LAYERS = [
     {"_custom_types", "_compat"},
     {"_linear", "_constraint"},
+    {"_mechanics"},
     {"_newton"},
+    {"_two_stage"},
     {"_projection"},
+    {"_chart", "_stabilization"},
     {"_interpolation", "_initial"},
     {"_solver"},
     {"_output"},

@@ -1,1 +1,3 @@
+from .local_coordinates import LocalCoordinates as LocalCoordinates
 from .projected import Projected as Projected
+from .stabilized import Stabilized as Stabilized

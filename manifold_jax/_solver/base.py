@@ -36,6 +36,7 @@ class AbstractManifoldSolver(dfx.AbstractWrappedSolver):
     constraint: eqx.AbstractVar[AbstractConstraint]
     projection: eqx.AbstractVar[NewtonProjection]  # also corrects what is handed out
     bend_interpolant: eqx.AbstractVar[bool]  # to end at the corrected state
+    corrects_output: eqx.AbstractVar[bool]  # whether what is handed out is corrected
 
     @property
     def solver(self) -> dfx.AbstractSolver:  # pyright: ignore
@@ -76,7 +77,16 @@ class AbstractManifoldSolver(dfx.AbstractWrappedSolver):
         return self.inner.func(terms, t0, y0, args)
 
 
-def check_inner_solver(solver: Any, hook: str) -> None:
+def check_hook_arguments(solver: Any, constraint: Any, hook: str) -> None:
+    _check_inner_solver(solver, hook)
+    if not isinstance(constraint, AbstractConstraint):
+        raise TypeError(
+            f"`constraint` must be an `mj.Constraint`, got {type(constraint).__name__}. "
+            "Wrap a residual function: `mj.Constraint(lambda t, y, args: ...)`."
+        )
+
+
+def _check_inner_solver(solver: Any, hook: str) -> None:
     """Refuse solvers whose steps cannot be corrected, naming what to write instead."""
     if isinstance(solver, type):
         raise TypeError(f"`solver` must be an instance: write `{hook}({solver.__name__}(), ...)`.")

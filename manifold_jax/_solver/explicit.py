@@ -35,6 +35,7 @@ def is_first_same_as_last(tableau: dfx.ButcherTableau) -> bool:
 def explicit_step(
     tableau: dfx.ButcherTableau,
     terms: AbstractTerm,
+    stage_terms: AbstractTerm,
     t0: RealScalarLike,
     t1: RealScalarLike,
     y0: Y,
@@ -44,6 +45,8 @@ def explicit_step(
 ) -> tuple[Y, Y, Y, dict[str, Any], Any, Any]:
     """Step from `y0`, with `f0` the vector field there, and correct the result.
 
+    `stage_terms` are evaluated at the stages, `terms` at corrected states.
+
     **Returns:**
 
     The corrected state, the uncorrected one, the embedded error estimate, the data of the
@@ -51,19 +54,23 @@ def explicit_step(
     returned besides the state.
     """
     control = terms.contr(t0, t1)
-    vf = jax.jit(lambda t, y: terms.vf(t, y, args))  # traced once, not once per stage
+    # Traced once, not once per stage.
+    at_corrected = jax.jit(lambda t, y: terms.vf(t, y, args))
+    at_stage = jax.jit(lambda t, y: stage_terms.vf(t, y, args))
+    if stage_terms is terms:
+        at_stage = at_corrected
     fsal = is_first_same_as_last(tableau)
     rows, nodes = list(tableau.a_lower), [float(c) for c in tableau.c]
     f, increments = f0, [terms.prod(f0, control)]
     for row, c in zip(rows[:-1] if fsal else rows, nodes, strict=False):
         y = _combine(row, increments, y0)
-        f = vf(jnp.asarray(t0 + c * (t1 - t0)), y)
+        f = at_stage(jnp.asarray(t0 + c * (t1 - t0)), y)
         increments.append(terms.prod(f, control))
     # The last stage of a first-same-as-last method is taken at the new state itself.
     raw = _combine(rows[-1] if fsal else tableau.b_sol, increments, y0)
     y1, info = correct(raw)
     if fsal:
-        f = vf(jnp.asarray(t1), y1)
+        f = at_corrected(jnp.asarray(t1), y1)
         increments.append(terms.prod(f, control))
     error = _combine(tableau.b_error, increments)
     k = jtu.tree_map(lambda *ks: jnp.stack(ks), *increments)

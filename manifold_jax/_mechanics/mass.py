@@ -1,0 +1,115 @@
+"""The mass matrix in its three forms (scalar, diagonal, matrix), factored once per evaluation."""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.flatten_util as jfu
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jaxtyping import Array, Float
+
+from .._custom_types import Args, BoolScalar, RealScalarLike, Y
+from .._linear import Factorization, factorize, gram, UNROLL_LIMIT
+
+
+class ConfigurationMass(eqx.Module):
+    """`M(q, args)` of the user, or a constant."""
+
+    function: Callable | Any
+
+    def __call__(self, t: RealScalarLike, q: Y, v: Y, args: Args) -> Any:
+        return self.function(q, args) if callable(self.function) else self.function
+
+
+class LagrangianMass(eqx.Module):
+    """`M = d^2 L / dv^2`."""
+
+    lagrangian: Callable
+
+    def __call__(self, t: RealScalarLike, q: Y, v: Y, args: Args) -> Float[Array, "n n"]:
+        w, unravel = jfu.ravel_pytree(v)
+        return jax.hessian(lambda w: self.lagrangian(t, q, unravel(w), args))(w)
+
+
+class Mass(eqx.Module):
+    """A factored mass matrix.
+
+    - `diagonal`: scalar or `(n,)`; `None` for a full matrix.
+    - `factorization`: of the full matrix, to which `C^T D C` has been added if it is singular.
+    - `augmentation`: the diagonal of `D`, shape `(m,)`, or `None` if it cannot be needed.
+    - `symmetric`, `positive`: whether the matrix can be used.
+    """
+
+    diagonal: Float[Array, "*n"] | None
+    factorization: Factorization | None
+    augmentation: Float[Array, " m"] | None
+    symmetric: BoolScalar
+    positive: BoolScalar
+
+    @property
+    def valid(self) -> BoolScalar:
+        return self.symmetric & self.positive
+
+    def solve(self, rows: Float[Array, "*k n"]) -> Float[Array, "*k n"]:
+        """`M^-1` applied to each row."""
+        if self.factorization is None:
+            return rows / jnp.broadcast_to(self.diagonal, rows.shape)
+        return self.factorization.solve(rows.T).T
+
+
+def mass_values(mass_matrix: Any, q: Y) -> Float[Array, "..."]:
+    """What `mass_matrix` returned as a scalar, a diagonal `(n,)` or a matrix `(n, n)`."""
+    x, _ = jfu.ravel_pytree(q)
+    n = x.size
+    same_structure = jtu.tree_structure(mass_matrix) == jtu.tree_structure(q)
+    if eqx.is_array_like(mass_matrix):
+        shape = jnp.shape(mass_matrix)
+        if shape in ((), (n,), (n, n)):
+            return jnp.asarray(mass_matrix, x.dtype)
+    if same_structure:
+        try:
+            spread = lambda M, leaf: jnp.broadcast_to(jnp.asarray(M, leaf.dtype), leaf.shape)
+            return jfu.ravel_pytree(jtu.tree_map(spread, mass_matrix, q))[0]
+        except ValueError:
+            pass
+    shapes = jtu.tree_map(jnp.shape, mass_matrix)
+    raise ValueError(
+        f"`mass_matrix` must be a scalar, a diagonal of shape ({n},) or like q, or a matrix of shape ({n}, {n}) "
+        f"for q of {n} numbers, got {shapes}."
+    )
+
+
+def factorize_mass(M: Float[Array, "..."], C: Float[Array, "m n"]) -> Mass:
+    """Factor `M`, of one of the forms of `mass_values`, under constraints `C a = b`.
+
+    A singular matrix is allowed if it is positive definite on the null space of `C`, that is
+    if the matrix `[[M, C^T], [C, 0]]` is regular: then `M + C^T D C` is positive definite for
+    every `D > 0` and has the same accelerations (augmented Lagrangian; Benzi, Golub & Liesen,
+    Acta Numerica 14 (2005) 1-137, section 5).
+    """
+    yes = jnp.asarray(True)
+    if M.ndim < 2:
+        positive = jnp.all(M > 0)
+        return Mass(jnp.where(positive, M, 1), None, None, yes, positive)
+    asymmetry = jnp.max(jnp.abs(M - M.T))
+    symmetric = asymmetry <= 100 * jnp.finfo(M.dtype).eps * jnp.max(jnp.abs(M))
+    plain = _factorize_positive(M)
+    size = jnp.maximum(jnp.sum(C * C, axis=1), jnp.finfo(M.dtype).tiny)
+    weights = jax.lax.stop_gradient(jnp.trace(M) / M.shape[0] / size)
+    augmented = lambda: _factorize_positive(M + gram((C * weights[:, None]).T, C.T))
+    factorization = jax.lax.cond(plain.full_rank, lambda: plain, augmented)
+    augmentation = jnp.where(plain.full_rank, 0, weights)
+    return Mass(None, factorization, augmentation, symmetric, factorization.full_rank)
+
+
+def _factorize_positive(M: Float[Array, "n n"]) -> Factorization:
+    if M.shape[0] <= UNROLL_LIMIT:
+        return factorize(M)  # which wants positive pivots
+    size = jnp.sqrt(jnp.maximum(jnp.abs(jnp.diagonal(M)), jnp.finfo(M.dtype).tiny))
+    lower = jnp.linalg.cholesky(jax.lax.stop_gradient(M / size[:, None] / size[None, :]))
+    threshold = 10 * M.shape[0] * jnp.finfo(M.dtype).eps
+    positive = jnp.all(jnp.diagonal(lower) ** 2 > threshold)  # NaN unless positive definite
+    factorization = factorize(jnp.where(positive, M, jnp.eye(M.shape[0], dtype=M.dtype)))
+    return Factorization(factorization.lu, positive)

@@ -1,0 +1,153 @@
+"""What the step hooks have in common: one step of the wrapped solver, and the verdict on it."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from diffrax import RESULTS
+from jaxtyping import Array
+
+from .._compat import is_okay, nonlinear_failure, update_result
+from .._custom_types import Args, BoolScalar, FloatScalar, IntScalar, RealScalarLike, Y
+from .._projection import ProjectionInfo
+from .explicit import explicit_step, is_first_same_as_last, is_unrollable, refreshed
+
+
+class StepStatistics(eqx.Module):
+    """Totals over the accepted steps of a solve."""
+
+    iterations: IntScalar
+    largest_correction: FloatScalar
+
+    @staticmethod
+    def zero(y: Y) -> "StepStatistics":
+        dtype = jnp.result_type(*jtu.tree_leaves(y))
+        return StepStatistics(jnp.zeros((), jnp.int32), jnp.zeros((), dtype))
+
+    def including(self, info: ProjectionInfo) -> "StepStatistics":
+        return StepStatistics(
+            self.iterations + info.iterations,
+            jnp.maximum(
+                self.largest_correction, info.correction.astype(self.largest_correction.dtype)
+            ),
+        )
+
+
+class HookState(eqx.Module):
+    """Carried from step to step: the wrapped solver's own state, the size of the first step
+    that was tried (the scale of time near t = 0), and the totals."""
+
+    inner: Any
+    first_step: FloatScalar
+    statistics: StepStatistics
+
+
+class Step(NamedTuple):
+    """One attempted step: the state, corrected and `raw`, and what the wrapped solver returned."""
+
+    y1: Y
+    raw: Y
+    error: Y | None
+    dense_info: dict[str, Any]
+    inner_state: Any
+    result: RESULTS
+    info: ProjectionInfo
+
+
+def initial_state(
+    inner: dfx.AbstractSolver, terms: Any, t0: RealScalarLike, t1: RealScalarLike, y0: Y, args: Args
+) -> HookState:
+    if is_unrollable(inner, terms, t0, t1, y0, args):
+        fsal = is_first_same_as_last(inner.tableau)  # pyright: ignore
+        inner_state = terms.vf(t0, y0, args) if fsal else None
+    else:
+        inner_state = inner.init(terms, t0, t1, y0, args)
+    return HookState(inner_state, jnp.abs(jnp.asarray(t1) - t0), StepStatistics.zero(y0))
+
+
+def advance(
+    inner: dfx.AbstractSolver,
+    terms: Any,
+    stage_terms: Any,
+    t0: RealScalarLike,
+    t1: RealScalarLike,
+    y0: Y,
+    args: Args,
+    inner_state: Any,
+    made_jump: Any,
+    correct: Callable[[Y], tuple[Y, ProjectionInfo]],
+) -> Step:
+    """One step of `inner`, its end corrected. `stage_terms` are `terms` as seen by the stages,
+    which are not corrected; both agree on corrected states."""
+    if is_unrollable(inner, terms, t0, t1, y0, args):
+        tableau = inner.tableau  # pyright: ignore
+        fsal = is_first_same_as_last(tableau)
+        evaluate = lambda: terms.vf(t0, y0, args)
+        f0 = refreshed(made_jump, inner_state, evaluate) if fsal else evaluate()
+        y1, raw, error, dense_info, f1, info = explicit_step(
+            tableau, terms, stage_terms, t0, t1, y0, args, f0, correct
+        )
+        return Step(y1, raw, error, dense_info, f1 if fsal else None, RESULTS.successful, info)
+    # The derivative that the solver carried over belongs to the uncorrected state.
+    # Diffrax evaluates it anew if any lane of a batch needs it, so that keeping it
+    # would make the lanes depend on each other; always evaluating it does not.
+    raw, error, dense_info, inner_state, result = inner.step(
+        stage_terms, t0, t1, y0, args, inner_state, made_jump=True
+    )
+    y1, info = correct(raw)
+    return Step(y1, raw, error, dense_info, inner_state, result, info)
+
+
+def conclude(
+    step: Step, t0: RealScalarLike, t1: RealScalarLike, state: HookState, raise_error: bool
+) -> tuple[Y, Y | None, dict[str, Any], HookState, RESULTS]:
+    """What a solver's `step` returns. A step that could not be corrected is to be rejected; with
+    `raise_error` the error estimate is at least the size of the correction."""
+    corrected = RESULTS.where(step.info.success, RESULTS.successful, nonlinear_failure())
+    result, error = update_result(step.result, corrected), step.error
+    if error is not None:
+        repeatable = is_repeatable(t0, t1, state.first_step)
+        if raise_error:
+            error = _at_least(error, step.raw, step.y1, repeatable)
+        error = rejecting(error, is_okay(result), repeatable)
+    correction = jtu.tree_map(jnp.subtract, step.y1, step.raw)
+    dense_info = dict(corrected=step.y1, correction=correction, **step.dense_info)
+    statistics = state.statistics.including(step.info)
+    state = HookState(step.inner_state, state.first_step, statistics)
+    return step.y1, error, dense_info, state, result
+
+
+def is_repeatable(t0: RealScalarLike, t1: RealScalarLike, first_step: FloatScalar) -> BoolScalar:
+    """Whether a smaller step is possible at all within the precision of the time."""
+    t0, t1 = jnp.asarray(t0), jnp.asarray(t1)
+    scale = jnp.maximum(jnp.maximum(jnp.abs(t0), jnp.abs(t1)), first_step)
+    smallest = 100 * jnp.finfo(t1.dtype).eps * scale
+    return jnp.abs(t1 - t0) > smallest
+
+
+def _at_least(error: Y, raw: Y, y1: Y, repeatable: BoolScalar) -> Y:
+    """The correction is a lower bound of the local error (Sudarsan & Keerthi 1998, 3.4).
+
+    Unless the step started off the manifold: then no step is small enough, and the smallest
+    one is let through.
+    """
+
+    def raised(e: Array, a: Array, b: Array) -> Array:
+        bound = jax.lax.stop_gradient(jnp.abs(a - b))
+        return jnp.where(repeatable, jnp.maximum(jnp.abs(e), bound), e)
+
+    return jtu.tree_map(raised, error, y1, raw)
+
+
+def rejecting(error: Y, success: BoolScalar, repeatable: BoolScalar) -> Y:
+    """Error estimate of a step that may have failed.
+
+    An infinite error makes an adaptive controller reject the step and try a smaller one.
+    Where there is none the step is let through, and its result code ends the solve.
+    """
+    verdict = jnp.where(repeatable, jnp.inf, 0.0)
+    return jtu.tree_map(lambda e: jnp.where(success, e, verdict.astype(e.dtype)), error)

@@ -1,0 +1,40 @@
+"""Terms whose vector field is changed by a step hook."""
+
+from collections.abc import Callable
+from typing import Any
+
+import diffrax as dfx
+import jax.tree_util as jtu
+
+from .._custom_types import Args, RealScalarLike, Y
+
+
+class RewrittenTerm(dfx.AbstractTerm):
+    """`term` with the vector field `field(term, t, y, args)`."""
+
+    term: dfx.AbstractTerm
+    field: Callable
+
+    def vf(self, t: RealScalarLike, y: Y, args: Args) -> Any:
+        return self.field(self.term, t, y, args)
+
+    def contr(self, t0: RealScalarLike, t1: RealScalarLike, **kwargs: Any) -> Any:
+        return self.term.contr(t0, t1, **kwargs)
+
+    def prod(self, vf: Any, control: Any) -> Y:
+        return self.term.prod(vf, control)
+
+    def is_vf_expensive(self, t0: RealScalarLike, t1: RealScalarLike, y: Y, args: Args) -> bool:
+        return self.term.is_vf_expensive(t0, t1, y, args)
+
+
+def rewrite_terms(terms: Any, rewrite: Callable[[dfx.AbstractTerm], dfx.AbstractTerm]) -> Any:
+    """Rewrite each term of a pytree of terms, also inside `MultiTerm`s."""
+    is_leaf = lambda x: isinstance(x, dfx.AbstractTerm) and not isinstance(x, dfx.MultiTerm)
+    return jtu.tree_map(rewrite, terms, is_leaf=is_leaf)
+
+
+def has_several(terms: Any) -> bool:
+    """Whether a pytree of terms has a sum of terms in it."""
+    is_leaf = lambda x: isinstance(x, dfx.MultiTerm)
+    return any(is_leaf(leaf) for leaf in jtu.tree_leaves(terms, is_leaf=is_leaf))

@@ -1,0 +1,146 @@
+"""Constraint stabilization: a vector field that is drawn to the manifold."""
+
+from typing import Any
+
+import diffrax as dfx
+import jax
+import jax.numpy as jnp
+from diffrax import RESULTS
+
+from .._compat import is_sde, time_direction
+from .._constraint import AbstractConstraint, check_constraint
+from .._custom_types import Args, BoolScalar, RealScalarLike, Y
+from .._interpolation import CorrectedInterpolationFactory
+from .._projection import NewtonProjection, ProjectionInfo
+from .._stabilization import (
+    AbstractStabilization,
+    ExactStabilization,
+    is_stable,
+)
+from .advance import advance, conclude, HookState, initial_state
+from .base import AbstractManifoldSolver, check_hook_arguments
+from .rewrite import has_several, rewrite_terms, RewrittenTerm
+
+
+class Stabilized(AbstractManifoldSolver):
+    """Any one-step solver with a stabilized vector field: violations decay, but are not zero
+    (constraint stabilization).
+
+    Works forward and backward in time: violations decay in the direction of integration.
+    What is handed out is not corrected (except with `ExactStabilization(0)`): the violation
+    is of the size of the tolerance. Use [`Projected`][] for values on the manifold.
+
+    **Arguments:**
+
+    - `solver`, `constraint`: as for [`Projected`][]; ordinary differential equations only.
+    - `stabilization`: [`InvariantStabilization`][] or [`ExactStabilization`][].
+        [`Baumgarte`][] and [`VelocityStabilization`][] change the
+        accelerations of a [`MechanicalSystem`][] instead.
+    - `projection`: metric of the correction, [`NewtonProjection`][].
+
+    **Raises:**
+
+    As [`Projected`][]. A step with `gain * h` beyond the stability interval of an explicit
+    solver is rejected, or ends the solve with `RESULTS.nonlinear_divergence` if steps are
+    constant.
+
+    Source: Sudarsan & Keerthi (1998), section 3.3; Ascher, Chin & Reich, Numer. Math. 67
+    (1994) 131-149.
+    """
+
+    inner: dfx.AbstractSolver
+    constraint: AbstractConstraint
+    projection: NewtonProjection
+    stabilization: AbstractStabilization
+    bend_interpolant: bool
+
+    def __init__(
+        self,
+        solver: dfx.AbstractSolver,
+        constraint: AbstractConstraint,
+        *,
+        stabilization: AbstractStabilization,
+        projection: NewtonProjection | None = None,
+    ):
+        check_hook_arguments(solver, constraint, "Stabilized")
+        if not isinstance(stabilization, AbstractStabilization):
+            raise TypeError(
+                "`stabilization` must be `mj.InvariantStabilization(gain)` or `mj.ExactStabilization(gain)`, "
+                f"got {type(stabilization).__name__}. Baumgarte's method is an argument of `mj.MechanicalSystem`."
+            )
+        self.inner = solver
+        self.constraint = constraint
+        self.projection = NewtonProjection() if projection is None else projection
+        self.stabilization = stabilization
+        self.bend_interpolant = True
+
+    @property
+    def corrects_output(self) -> bool:
+        exact = isinstance(self.stabilization, ExactStabilization)
+        return exact and self.stabilization.ends_on_manifold
+
+    @property
+    def interpolation_cls(self):  # pyright: ignore
+        return CorrectedInterpolationFactory(
+            self.inner.interpolation_cls, self.bend_interpolant and self.corrects_output
+        )
+
+    def func(self, terms, t0: RealScalarLike, y0: Y, args: Args) -> Any:
+        return self.inner.func(self._stabilized(terms), t0, y0, args)
+
+    def init(self, terms, t0: RealScalarLike, t1: RealScalarLike, y0: Y, args: Args) -> HookState:
+        if is_sde(terms):
+            raise ValueError(
+                "`terms` has noise, which no stabilization of the drift keeps on the manifold. Use "
+                "`mj.Projected(solver, constraint)`."
+            )
+        if has_several(terms):
+            raise ValueError(
+                "`terms` is a `MultiTerm`: which of its vector fields should be stabilized is not defined. Add "
+                "them up in one `diffrax.ODETerm`, or use `mj.Projected(solver, constraint)`."
+            )
+        check_constraint(self.constraint, t0, y0, args)
+        return initial_state(self.inner, self._stabilized(terms), t0, t1, y0, args)
+
+    def step(
+        self,
+        terms,
+        t0: RealScalarLike,
+        t1: RealScalarLike,
+        y0: Y,
+        args: Args,
+        solver_state: HookState,
+        made_jump: Any,
+    ) -> tuple[Y, Y | None, dict[str, Any], HookState, RESULTS]:
+        time = t1 * time_direction(terms)
+        stable = is_stable(self.stabilization.gain, jnp.asarray(t1) - t0, self.solver)
+
+        def correct(y: Y) -> tuple[Y, ProjectionInfo]:
+            if not self.corrects_output:
+                return y, _no_correction(y, stable)
+            return self.projection(self.constraint, time, y, args, fallback=y0)
+
+        terms = self._stabilized(terms)
+        step = advance(
+            self.inner, terms, terms, t0, t1, y0, args, solver_state.inner, made_jump, correct
+        )
+        raise_error = self.corrects_output and self.projection.rtol is not None
+        return conclude(step, t0, t1, solver_state, raise_error)
+
+    def _stabilized(self, terms: Any) -> Any:
+        direction = time_direction(terms)
+
+        def field(term, t, y, args):
+            f = lambda t, y, args: term.vf(t * direction, y, args)
+            return self.stabilization.field(
+                f, self.constraint, self.projection, direction, t * direction, y, args
+            )
+
+        return rewrite_terms(terms, lambda term: RewrittenTerm(term, field))
+
+
+def _no_correction(y: Y, success: BoolScalar) -> ProjectionInfo:
+    dtype = jnp.result_type(*jax.tree_util.tree_leaves(y))
+    zero = jnp.zeros((), dtype)
+    none = jnp.zeros((0,), dtype)
+    return ProjectionInfo(none, jnp.zeros((), jnp.int32), zero, zero, jnp.asarray(True), success)
