@@ -91,7 +91,7 @@ def dependent_coordinates(G: Float[Array, "m n"]) -> Float[Array, " n"]:
 
 def push_forward(
     constraint: AbstractConstraint,
-    t: Array,
+    t: RealScalarLike,
     y: Y,
     args: Args,
     directions: Float[Array, "m n"],
@@ -105,6 +105,7 @@ def push_forward(
     Source: Sudarsan & Keerthi, Appl. Math. Comput. 92 (1998) 153-193 (error tolerances of the
     local coordinates).
     """
+    t = jnp.asarray(t)
     e, unravel = jfu.ravel_pytree(vector)
     if isinstance(constraint, MechanicalConstraint):
         return _push_forward_mechanics(constraint, t, y, args, directions, vector)

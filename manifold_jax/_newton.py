@@ -155,6 +155,30 @@ def linearize(problem: CorrectionProblem) -> Linearization:
     return Linearization(G, factorize(gram(G, problem.weighted(G)), problem.redundant))
 
 
+def correct_once(
+    problem: CorrectionProblem,
+    safe: Float[Array, " n"],
+    linearization: Linearization | None = None,
+) -> CorrectionRoot:
+    """One Newton step, `x - V (G V)^-1 g(x)`, successful if it lowers the residual.
+
+    Differentiated as it stands: it is a map of its own, not an approximation of the root.
+    """
+    finite = jnp.all(jnp.isfinite(problem.x))
+    problem = problem._replace(x=jnp.where(finite, problem.x, safe))
+    G, factorization = linearize(problem) if linearization is None else linearization
+    equations = _Equations(problem, problem.weighted(G), row_scale(G, problem.x))
+    r = problem.g(problem.x)
+    z = -factorization.solve(r)
+    before, (_, after) = equations.level(r), equations.at(z)
+    rounding = 50 * jnp.finfo(r.dtype).eps
+    success = finite & factorization.full_rank & (after <= jnp.maximum(before, rounding))
+    p = jnp.where(success, equations.point(z), problem.x)
+    residual = jnp.where(finite, after, jnp.nan)
+    iterations = jnp.ones((), jnp.int32)
+    return CorrectionRoot(p, z, iterations, residual, factorization.full_rank, success)
+
+
 @eqx.filter_custom_jvp
 def solve_correction(
     problem: CorrectionProblem,

@@ -26,7 +26,7 @@ from ._constraint import (
 from ._custom_types import Args, BoolScalar, FloatScalar, IntScalar, RealScalarLike, Y
 from ._mechanics import MechanicalConstraint
 from ._mechanics.constraint import Kinematics
-from ._newton import CorrectionProblem, CorrectionRoot, solve_correction
+from ._newton import correct_once, CorrectionProblem, CorrectionRoot, solve_correction
 from ._two_stage import correct_in_two_stages, Settings
 
 
@@ -67,7 +67,10 @@ class NewtonProjection(eqx.Module):
         the mass matrix for the constraint of a [`MechanicalSystem`][]; `"identity"` in any case; `"error"` for
         the norm of the step size controller, `w_j = 1 / (atol + rtol |y_j|)^2`; or a pytree
         like `y` of positive weights `w_j`, large for components that should stay put.
-    - `max_steps`: the most Newton iterations before the projection fails.
+    - `max_steps`: the most Newton iterations before the projection fails. 1 is a method of
+        its own, post-stabilization: one Newton step per step of the solver, successful if it
+        lowers the residual; states are then near the manifold (the square of the local error),
+        not on it to round-off.
     - `tolerance`: the largest scaled residual that counts as success. `None` is 50
         rounding units of the state's type.
     - `rtol`, `atol`: the tolerances of the step size controller; `mj.diffeqsolve` fills
@@ -77,7 +80,8 @@ class NewtonProjection(eqx.Module):
     Prefer a metric other than the identity when components have different units.
 
     Source: Sudarsan & Keerthi, Appl. Math. Comput. 92 (1998) 153-193, section 3.1 (scaled
-    residual test); Eich, SIAM J. Numer. Anal. 30 (1993) 1467-1482 (coordinate projection).
+    residual test); Eich, SIAM J. Numer. Anal. 30 (1993) 1467-1482 (coordinate projection);
+    Ascher, Chin, Petzold & Reich, Mech. Struct. Mach. 23 (1995) 135-157 (post-stabilization).
     """
 
     metric: Literal["identity", "error"] | Any | None = None
@@ -126,9 +130,14 @@ class NewtonProjection(eqx.Module):
         # Parameters that `g` closes over become inputs, so that they are differentiated.
         residual = eqx.filter_closure_convert(residual, t, x, args)
         inverse_metric = self._inverse_metric(y, x)
-        problem = CorrectionProblem(residual, t, x, args, inverse_metric, directions)
+        problem = CorrectionProblem(
+            residual, t, x, args, inverse_metric, directions, constraint.redundant
+        )
         tolerance = self.tolerance_for(x.dtype)
-        root = solve_correction(problem, safe, self.max_steps, tolerance, far)
+        if self.max_steps == 1 and not far:
+            root = correct_once(problem, safe)
+        else:
+            root = solve_correction(problem, safe, self.max_steps, tolerance, far)
         return unravel(root.p), _information(x, root)
 
     def _correct_mechanics(

@@ -116,13 +116,32 @@ class ExactStabilization(AbstractStabilization):
         return isinstance(self.gain, int | float) and self.gain == 0
 
     def field(self, f, constraint, projection, sign, t, y, args):
-        point, info = projection(constraint, t, y, args)
+        whole = _WholeState(constraint)
+        point, info = projection(whole, t, y, args)
+        if not self.ends_on_manifold:
+            # Again along the normals at that point: the nearest one to one more order, without
+            # which the change of the distance would have a part of the size of its square.
+            _, directions = projection.correction_directions(whole, t, point, args)
+            point, info = projection(whole, t, y, args, directions=directions)
         undefined = jnp.where(info.success, 0.0, jnp.nan)
 
         def stabilized(derivative, p, y):
             return derivative + sign * self.gain * (p - y) + undefined.astype(p.dtype)
 
         return jtu.tree_map(stabilized, f(t, point, args), point, y)
+
+
+class _WholeState(AbstractConstraint):
+    """A constraint corrected as one, not positions first: the nearest point in all components."""
+
+    constraint: AbstractConstraint
+
+    @property
+    def redundant(self) -> bool:
+        return self.constraint.redundant
+
+    def __call__(self, t: RealScalarLike, y: Y, args: Args = None) -> Any:
+        return self.constraint(t, y, args)
 
 
 def is_stable(gain: RealScalarLike, step: RealScalarLike, solver: dfx.AbstractSolver) -> BoolScalar:

@@ -22,7 +22,13 @@ from ._custom_types import Args, BoolScalar, Y
 from ._linear import factorize, gram
 from ._mechanics import MechanicalConstraint
 from ._mechanics.constraint import Kinematics
-from ._newton import CorrectionProblem, CorrectionRoot, Linearization, solve_correction
+from ._newton import (
+    correct_once,
+    CorrectionProblem,
+    CorrectionRoot,
+    Linearization,
+    solve_correction,
+)
 
 
 class Settings(NamedTuple):
@@ -106,6 +112,8 @@ class _Stages(NamedTuple):
 
     def _solve(self, problem, safe, linearization) -> CorrectionRoot:
         settings = self.settings
+        if settings.max_steps == 1 and not settings.far:
+            return correct_once(problem, safe, linearization)
         return solve_correction(
             problem, safe, settings.max_steps, settings.tolerance, settings.far, linearization
         )

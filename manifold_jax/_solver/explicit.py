@@ -16,6 +16,7 @@ import jax.tree_util as jtu
 from diffrax import AbstractTerm
 
 from .._custom_types import Args, RealScalarLike, Y
+from .._projection import ProjectionInfo
 
 
 def is_unrollable(solver: dfx.AbstractSolver, terms: Any, t0, t1, y0: Y, args: Args) -> bool:
@@ -41,8 +42,8 @@ def explicit_step(
     y0: Y,
     args: Args,
     f0: Any,
-    correct: Callable[[Y], tuple[Y, Any]],
-) -> tuple[Y, Y, Y, dict[str, Any], Any, Any]:
+    correct: Callable[[Y], tuple[Y, ProjectionInfo]],
+) -> tuple[Y, Y, Y, dict[str, Any], Any, ProjectionInfo]:
     """Step from `y0`, with `f0` the vector field there, and correct the result.
 
     `stage_terms` are evaluated at the stages, `terms` at corrected states.
@@ -70,7 +71,9 @@ def explicit_step(
     raw = _combine(rows[-1] if fsal else tableau.b_sol, increments, y0)
     y1, info = correct(raw)
     if fsal:
-        f = at_corrected(jnp.asarray(t1), y1)
+        # A failed step may end in NaN, of which the derivative would be NaN, not zero.
+        safe = lambda a, b: jnp.where(info.success, a, jax.lax.stop_gradient(b))
+        f = at_corrected(jnp.asarray(t1), jtu.tree_map(safe, y1, y0))
         increments.append(terms.prod(f, control))
     error = _combine(tableau.b_error, increments)
     k = jtu.tree_map(lambda *ks: jnp.stack(ks), *increments)

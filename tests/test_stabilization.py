@@ -1,0 +1,244 @@
+"""Constraint stabilization: violations decay as the formulas say, in both directions of time."""
+
+import diffrax as dfx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import manifold_jax as mj
+
+
+GAIN, SPAN = 3.0, 1.0
+TIGHT = dfx.PIDController(rtol=1e-11, atol=1e-11)
+DECAYING = {
+    "invariant, projected": mj.InvariantStabilization(GAIN, projected=True),
+    "exact": mj.ExactStabilization(GAIN),
+}
+PROBLEMS = ["rigid-body", "kepler", "pendulum", "car-axis"]
+
+
+def residual(problem, t, y):
+    leaves = jax.tree.leaves(problem.constraint(t, y, problem.args))
+    return np.concatenate([np.ravel(leaf) for leaf in leaves])
+
+
+def start_off(problem, size):
+    """A start off the manifold along its normals, where constraints and distance agree."""
+    flat, unravel = jax.flatten_util.ravel_pytree(problem.y0)
+    g = lambda x: jax.flatten_util.ravel_pytree(
+        problem.constraint(problem.t0, unravel(x), problem.args)
+    )[0]
+    G = np.asarray(jax.jacobian(g)(flat))
+    normal = np.linalg.pinv(G) @ np.linspace(1, 2, G.shape[0])
+    return unravel(flat + size * normal / np.linalg.norm(normal))
+
+
+def distance(problem, t, y):
+    """From the nearest point, found by Newton's method on its own equations in NumPy."""
+    flat, unravel = jax.flatten_util.ravel_pytree(y)
+    g = lambda x: jax.flatten_util.ravel_pytree(problem.constraint(t, unravel(x), problem.args))[0]
+    x0, p = np.asarray(flat), np.asarray(flat)
+    for _ in range(30):
+        G = np.asarray(jax.jacobian(g)(jnp.asarray(p)))
+        r = np.asarray(g(jnp.asarray(p)))
+        # the point of the tangent plane at p nearest to x0
+        p = x0 + np.linalg.pinv(G) @ (G @ (p - x0) - r)
+    return np.linalg.norm(p - x0)
+
+
+def end(problem, stabilization, t0, t1, y0):
+    solver = mj.Stabilized(dfx.Dopri5(), problem.constraint, stabilization=stabilization)
+    sol = mj.diffeqsolve(
+        problem.terms,
+        solver,
+        t0,
+        t1,
+        None,
+        y0,
+        problem.args,
+        stepsize_controller=TIGHT,
+        max_steps=16384,
+        consistent="assume",
+    )
+    return jax.tree.map(lambda leaf: leaf[0], sol.ys)
+
+
+@pytest.mark.parametrize("name", PROBLEMS)
+@pytest.mark.parametrize("backward", [False, True])
+def test_projected_invariant_stabilization_decays_exponentially(name, backward):
+    """METHODS 10.4: |g(1)| / |g(0)| = exp(-3), forward and backward."""
+    problem = mj.problems.ALL[name]()
+    y0 = start_off(problem, 1e-3)
+    t1 = problem.t0 - SPAN if backward else problem.t0 + SPAN
+    y1 = end(problem, DECAYING["invariant, projected"], problem.t0, t1, y0)
+    before, after = residual(problem, problem.t0, y0), residual(problem, t1, y1)
+    np.testing.assert_allclose(after / before, np.exp(-GAIN * SPAN), rtol=1e-5)
+
+
+@pytest.mark.parametrize("name", ["rigid-body", "kepler", "sphere-flow"])
+def test_exact_stabilization_decays_exponentially(name):
+    """METHODS 10.4, for the distance from the manifold."""
+    problem = mj.problems.ALL[name]()
+    y0 = start_off(problem, 3e-4)
+    y1 = end(problem, DECAYING["exact"], problem.t0, problem.t0 + SPAN, y0)
+    ratio = distance(problem, problem.t0 + SPAN, y1) / distance(problem, problem.t0, y0)
+    np.testing.assert_allclose(ratio, np.exp(-GAIN * SPAN), rtol=1e-5)
+
+
+STABILIZATIONS = {
+    "invariant": mj.InvariantStabilization(20.0),
+    **DECAYING,
+    "projected stages": mj.ExactStabilization(0),
+}
+
+
+@pytest.mark.parametrize("which", STABILIZATIONS)
+@pytest.mark.parametrize("backward", [False, True])
+def test_violations_decay_in_the_direction_of_integration(which, backward):
+    """A time-dependent constraint; the plain solver stays off it."""
+    problem = mj.problems.car_axis()
+    t1 = problem.t0 - SPAN if backward else problem.t0 + SPAN
+    y0 = start_off(problem, 1e-4)
+    y1 = end(problem, STABILIZATIONS[which], problem.t0, t1, y0)
+    violation = np.abs(residual(problem, t1, y1)).max()
+    if which == "projected stages":
+        assert violation <= 1e-14
+    elif which == "exact":
+        ratio = distance(problem, t1, y1) / distance(problem, problem.t0, y0)
+        np.testing.assert_allclose(ratio, np.exp(-GAIN * SPAN), rtol=1e-4)
+    else:
+        assert violation <= 0.06 * np.abs(residual(problem, problem.t0, y0)).max()
+
+
+def test_stages_projected_hands_out_values_on_the_manifold():
+    problem = mj.problems.rigid_body()
+    solver = mj.Stabilized(dfx.Tsit5(), problem.constraint, stabilization=mj.ExactStabilization(0))
+    sol = mj.diffeqsolve(
+        problem.terms,
+        solver,
+        problem.t0,
+        problem.t1,
+        None,
+        problem.y0,
+        problem.args,
+        saveat=dfx.SaveAt(ts=jnp.linspace(problem.t0, problem.t1, 50), dense=True),
+        stepsize_controller=dfx.PIDController(rtol=1e-6, atol=1e-6),
+    )
+    assert mj.constraint_violation(problem.constraint, sol.ts, sol.ys, problem.args) <= 1e-15
+    y = sol.evaluate(0.5 * problem.t1)
+    assert mj.constraint_violation(problem.constraint, 0.5 * problem.t1, y, problem.args) <= 1e-15
+
+
+def pendulum_system(stabilization):
+    return mj.MechanicalSystem(
+        1.0,
+        lambda t, q, args: q @ q - 1.0,
+        lambda t, q, v, args: jnp.array([0.0, -9.81]),
+        stabilization=stabilization,
+    )
+
+
+@pytest.mark.parametrize("backward", [False, True])
+def test_baumgarte(backward):
+    """`phi'' + 2 alpha phi' + beta^2 phi = 0` in the direction of integration: with the start
+    phi = d, phi' = 0 and alpha = beta, phi(t) = d (1 + alpha t) exp(-alpha t)."""
+    alpha, d = 4.0, 1e-3
+    system = pendulum_system(mj.Baumgarte(alpha, alpha))
+    y0 = jnp.array([np.sqrt(1 + d), 0.0]), jnp.zeros(2)
+    t1 = -1.0 if backward else 1.0
+    sol = dfx.diffeqsolve(
+        system.terms, dfx.Dopri8(), 0.0, t1, 0.01 * t1, y0, stepsize_controller=TIGHT
+    )
+    q, v = (np.asarray(leaf[0]) for leaf in sol.ys)
+    np.testing.assert_allclose(q @ q - 1, d * (1 + alpha) * np.exp(-alpha), rtol=1e-7)
+    np.testing.assert_allclose(2 * q @ v, -t1 * d * alpha**2 * np.exp(-alpha), rtol=1e-7)
+    # multipliers and accelerations are the physical ones, without stabilization
+    np.testing.assert_array_equal(
+        system.accelerations(0.0, y0), pendulum_system(None).accelerations(0.0, y0)
+    )
+
+
+def test_velocity_stabilization_keeps_positions_whatever_the_velocities():
+    system = pendulum_system(mj.VelocityStabilization())
+    y0 = jnp.array([0.6, 0.8]), jnp.array([0.3, 0.1])  # not tangent
+    (dq, _) = system.terms.vf(0.0, y0, None)
+    assert abs(y0[0] @ dq) <= 1e-16
+    tangent = jnp.array([0.8, -0.6])
+    np.testing.assert_allclose(dq, (y0[1] @ tangent) * tangent, atol=1e-16)
+
+
+@pytest.mark.parametrize(
+    ("solver", "interval"),
+    [(dfx.Euler(), 2.0), (dfx.Heun(), 2.0), (dfx.Bosh3(), 2.5127), (dfx.Dopri5(), 3.3066)],
+)
+def test_gains_beyond_the_stability_interval(solver, interval):
+    """Constant steps: refused, or with `throw=False` a failure code; just within: fine."""
+    problem = mj.problems.rigid_body()
+
+    def run(gain, **options):
+        hook = mj.Stabilized(
+            solver, problem.constraint, stabilization=mj.InvariantStabilization(gain)
+        )
+        return mj.diffeqsolve(
+            problem.terms, hook, 0.0, 1.0, 0.1, problem.y0, problem.args, **options
+        )
+
+    assert run(0.99 * interval / 0.1).result == dfx.RESULTS.successful
+    with pytest.raises(RuntimeError, match="stability interval"):
+        run(1.01 * interval / 0.1)
+    failed = run(1.01 * interval / 0.1, throw=False)
+    assert failed.result == dfx.RESULTS.nonlinear_divergence
+
+
+def test_adaptive_steps_stay_within_the_stability_interval():
+    problem = mj.problems.rigid_body()
+    hook = mj.Stabilized(
+        dfx.Dopri5(), problem.constraint, stabilization=mj.InvariantStabilization(100.0)
+    )
+    sol = mj.diffeqsolve(
+        problem.terms,
+        hook,
+        0.0,
+        5.0,
+        None,
+        problem.y0,
+        problem.args,
+        stepsize_controller=dfx.PIDController(rtol=1e-2, atol=1e-2),
+        saveat=dfx.SaveAt(steps=True),
+    )
+    steps = np.diff(np.asarray(sol.ts)[np.isfinite(sol.ts)], prepend=0.0)
+    assert steps.max() <= 3.31 / 100
+
+
+@pytest.mark.usefixtures("as_a_user_meets_it")
+def test_bad_stabilization():
+    constraint = mj.Constraint(lambda t, y, args: y @ y - 1.0)
+    for make in (
+        lambda: mj.InvariantStabilization(-1.0),
+        lambda: mj.ExactStabilization(-1.0),
+        lambda: mj.Baumgarte(-1.0, 1.0),
+        lambda: mj.Baumgarte(1.0, float("nan")),
+    ):
+        with pytest.raises(ValueError, match="must not be negative"):
+            make()
+    with pytest.raises(TypeError, match="mj.MechanicalSystem"):
+        mj.Stabilized(dfx.Tsit5(), constraint, stabilization=mj.Baumgarte(1.0, 1.0))
+    stabilized = mj.Stabilized(
+        dfx.KenCarp3(), constraint, stabilization=mj.InvariantStabilization(1.0)
+    )
+    terms = dfx.MultiTerm(dfx.ODETerm(lambda t, y, args: -y), dfx.ODETerm(lambda t, y, args: y))
+    with pytest.raises(ValueError, match="`terms` is a `MultiTerm`"):
+        mj.diffeqsolve(
+            terms, stabilized, 0.0, 1.0, 0.1, jnp.array([1.0, 0.0]), stepsize_controller=TIGHT
+        )
+    noise = dfx.ControlTerm(lambda t, y, args: y, dfx.UnsafeBrownianPath((), jax.random.key(0)))
+    sde = dfx.MultiTerm(dfx.ODETerm(lambda t, y, args: -y), noise)
+    stabilized = mj.Stabilized(dfx.Heun(), constraint, stabilization=mj.InvariantStabilization(1.0))
+    with pytest.raises(ValueError, match="`terms` has noise"):
+        mj.diffeqsolve(sde, stabilized, 0.0, 1.0, 0.1, jnp.array([1.0, 0.0]))
+    system = pendulum_system(mj.Baumgarte(50.0, 50.0))
+    with pytest.raises(RuntimeError, match="stability interval"):
+        mj.diffeqsolve(
+            system.terms, dfx.Tsit5(), 0.0, 1.0, 0.1, (jnp.array([1.0, 0.0]), jnp.zeros(2))
+        )
