@@ -14,6 +14,7 @@ from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
 
 if TYPE_CHECKING:
+    from ._compare.methods import Method
     from ._compare.task import Task
 
 
@@ -60,15 +61,30 @@ def compare(
         str,
         typer.Option(
             metavar="NAME",
-            help="Adaptive solver of Diffrax, run as it is and projected: heun, midpoint, "
+            help="Adaptive solver of Diffrax, run as it is and in every approach: heun, midpoint, "
             "ralston, bosh3, tsit5, dopri5, dopri8, impliciteuler, kvaerno3, kvaerno4, kvaerno5.",
         ),
     ] = "tsit5",
+    methods: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME,...",
+            help="Only these: plain, projected, one-step, invariant, exact, baumgarte, tangent, "
+            "partition, scipy-rk45, scipy-dop853, scipy-lsoda.",
+        ),
+    ] = None,
     rtol: Annotated[float, typer.Option(help="Relative tolerance of all methods.")] = 1e-6,
     atol: Annotated[float, typer.Option(help="Absolute tolerance of all methods.")] = 1e-6,
     t1: Annotated[
         float | None,
         typer.Option(metavar="T", help="End of the time span, by default that of the problem."),
+    ] = None,
+    gain: Annotated[
+        float | None,
+        typer.Option(
+            metavar="RATE",
+            help="Gain of the stabilizations, 1/time, by default 30 / time span of the problem.",
+        ),
     ] = None,
     json: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Write the table as JSON, too.")
@@ -81,35 +97,42 @@ def compare(
         ),
     ] = None,
 ) -> None:
-    """Solve one problem with a plain Diffrax solver, the projected one and SciPy.
+    """Solve one problem with a Diffrax solver in every approach to the manifold, and with SciPy.
 
     Prints for each method its steps, evaluations of the vector field, the largest constraint
     violation max |g| at the ends of the steps and at 1001 output times, the largest error of
     the state there, the median run time and the time to compile.
 
+    The approaches: `plain` ignores the constraint; `projected` corrects every step to
+    round-off, `one-step` by one Newton iteration; `invariant`, `exact` and `baumgarte` stabilize
+    the vector field (the last for mechanical systems only); `tangent` and `partition` integrate
+    in local coordinates, of the tangent space and of some of the components.
+
     The step limit that Diffrax needs is found automatically: 4096, doubled until the solve
     finishes, at most 1048576. It is stated below the table. A method that fails is reported
     in its row; the others go on.
     """
-    task = _task(problem, solver, rtol, atol, t1)
+    task = _task(problem, solver, rtol, atol, t1, gain)
+    chosen, left_out = _choose(methods, task)
     _check_target(json, "--json", None)
     _check_target(plot, "--plot", FIGURE_TYPES)
-    from ._compare.methods import measure_all
+    from ._compare.methods import measure
     from ._compare.report import comparison_notes, comparison_table, write_json
 
     measurements = []
     with _progress() as progress:
         status = progress.add_task("")
-        for name, measurement in measure_all(task):
-            progress.update(status, description=f"{task.problem.name}: {name}")
-            measurements.append(measurement())
+        for k, method in enumerate(chosen, 1):
+            of_all = f"{method.name(task)} ({k} of {len(chosen)})"
+            progress.update(status, description=f"{task.problem.name}: {of_all}")
+            measurements.append(measure(task, method))
         if plot is not None:
             progress.update(status, description="drawing")
             from ._compare.figure import write_figure
 
             write_figure(plot, task, measurements)
     if json is not None:
-        write_json(json, task, measurements)
+        write_json(json, task, measurements, left_out)
     output = _output()
     output.print(
         f"[bold]{task.problem.name}[/bold], t = {task.t0:g} to {task.t1:g}, "
@@ -117,7 +140,7 @@ def compare(
         highlight=False,
     )
     output.print(comparison_table(task, measurements))
-    for note in comparison_notes(task, measurements):
+    for note in comparison_notes(task, measurements, left_out):
         output.print(note, style="dim", highlight=False)
 
 
@@ -143,8 +166,11 @@ def paper() -> None:
         output.print(note, style="dim", highlight=False)
 
 
-def _task(problem: str, solver: str, rtol: float, atol: float, t1: float | None) -> "Task":
+def _task(
+    problem: str, solver: str, rtol: float, atol: float, t1: float | None, gain: float | None
+) -> "Task":
     """The task asked for, or an error that says what could have been asked for."""
+    from ._compare.approaches import default_gain
     from ._compare.task import Task
     from ._compare.with_diffrax import SOLVERS
     from .problems import ALL
@@ -152,17 +178,36 @@ def _task(problem: str, solver: str, rtol: float, atol: float, t1: float | None)
     problem, solver = problem.lower().replace("_", "-"), solver.lower()
     _check_name(problem, ALL, "problem", "PROBLEM")
     _check_name(solver, SOLVERS, "solver", "--solver")
-    for name, value in (("--rtol", rtol), ("--atol", atol)):
+    built = ALL[problem]()
+    gain = default_gain(built) if gain is None else gain
+    for name, value in (("--rtol", rtol), ("--atol", atol), ("--gain", gain)):
         if not (math.isfinite(value) and value > 0):
             raise typer.BadParameter(f"must be a positive number, got {value}.", param_hint=name)
-    built = ALL[problem]()
     t1 = built.t1 if t1 is None else t1
     if not (math.isfinite(t1) and t1 > built.t0):
         raise typer.BadParameter(
             f"must be later than the start of `{problem}`, t0 = {built.t0:g}; got {t1}.",
             param_hint="--t1",
         )
-    return Task(built, solver, rtol, atol, t1)
+    return Task(built, solver, rtol, atol, t1, gain)
+
+
+def _choose(names: str | None, task: "Task") -> tuple[list["Method"], list["Method"]]:
+    """Of the methods asked for, those that can solve the task, and those that cannot."""
+    from ._compare.methods import METHODS
+
+    known = [method.key for method in METHODS]
+    asked = known if names is None else [name.strip().lower() for name in names.split(",")]
+    for name in asked:
+        _check_name(name, known, "method", "--methods")
+    methods = [method for method in METHODS if method.key in asked]
+    chosen = [method for method in methods if method.applies_to(task)]
+    if not chosen:
+        raise typer.BadParameter(
+            f"{', '.join(asked)} needs a mechanical system, which `{task.problem.name}` is not.",
+            param_hint="--methods",
+        )
+    return chosen, [method for method in methods if method not in chosen]
 
 
 def _check_name(name: str, known: Iterable[str], kind: str, hint: str) -> None:

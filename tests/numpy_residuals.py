@@ -21,7 +21,7 @@ def harmonic_oscillator(t, y):
 
 def pendulum(t, y):
     q, v = y
-    return _columns(_dot(q, q) - 1, _dot(q, v))
+    return _columns(_dot(q, q) - 1, 2 * _dot(q, v))
 
 
 def rigid_body(t, y):
@@ -84,3 +84,83 @@ def sphere_flow(t, y):
 def rotation(t, y):
     gram = np.einsum("...ki,...kj->...ij", y, y) - np.eye(3)
     return gram.reshape(*gram.shape[:-2], 9)
+
+
+def chain(t, y):
+    """Links of length 1: any number of them."""
+    q, v = y
+    points, velocities = (part.reshape(*part.shape[:-1], -1, 2) for part in (q, v))
+    links, rates = points.copy(), velocities.copy()
+    links[..., 1:, :] -= points[..., :-1, :]
+    rates[..., 1:, :] -= velocities[..., :-1, :]
+    return np.concatenate([0.5 * _dot(links, links) - 0.5, _dot(links, rates)], axis=-1)
+
+
+def double_pendulum(t, y):
+    q, v = y
+    x1, y1, x2, y2 = np.moveaxis(q, -1, 0)
+    u1, w1, u2, w2 = np.moveaxis(v, -1, 0)
+    return _columns(
+        0.5 * (x1**2 + y1**2 - 1),
+        0.5 * ((x2 - x1) ** 2 + (y2 - y1) ** 2 - 1),
+        x1 * u1 + y1 * w1,
+        (x2 - x1) * (u2 - u1) + (y2 - y1) * (w2 - w1),
+    )
+
+
+def slider_crank(t, y):
+    q, v = y
+    crank, x, rod = np.moveaxis(q, -1, 0)
+    crank_rate, speed, rod_rate = np.moveaxis(v, -1, 0)
+    return _columns(
+        x - np.cos(rod) - 0.5 * np.cos(crank),
+        np.sin(rod) + 0.5 * np.sin(crank),
+        speed + np.sin(rod) * rod_rate + 0.5 * np.sin(crank) * crank_rate,
+        np.cos(rod) * rod_rate + 0.5 * np.cos(crank) * crank_rate,
+    )
+
+
+def four_bar(t, y):
+    """Ends of the three bodies as complex numbers, and their velocities."""
+    q, v = y
+    position, angle = q[..., 0::3] + 1j * q[..., 1::3], q[..., 2::3]
+    velocity, rate = v[..., 0::3] + 1j * v[..., 1::3], v[..., 2::3]
+    half = 0.5 * np.array([1.0, 2.5, 2.0]) * np.exp(1j * angle)
+    gaps = []
+    for center, arm in ((position, half), (velocity, 1j * rate * half)):
+        first, last = center - arm, center + arm
+        gaps += [first[..., 0], last[..., 0] - first[..., 1], last[..., 1] - last[..., 2]]
+        gaps += [first[..., 2]]
+    gaps[3] = gaps[3] - 2.2
+    gaps = _columns(*gaps)
+    return np.concatenate([gaps.real, gaps.imag], axis=-1)
+
+
+def parallelogram(t, y):
+    """Distances from the coupler's pins to the ends of the cranks, all of length 1."""
+    q, v = y
+    middle, tilt, angle = q[..., 0] + 1j * q[..., 1], q[..., 2], q[..., 3:]
+    velocity, tilting, rate = v[..., 0] + 1j * v[..., 1], v[..., 2], v[..., 3:]
+    columns = []
+    for i, pivot in enumerate((-0.5, 0.0, 0.5)):
+        arm, crank = pivot * np.exp(1j * tilt), -1j * np.exp(1j * angle[..., i])
+        columns += [middle + arm - pivot - crank]
+        columns += [velocity + 1j * tilting * arm - 1j * rate[..., i] * crank]
+    gaps = _columns(*columns)
+    return np.concatenate([gaps.real, gaps.imag], axis=-1)
+
+
+def spherical_pendulum(t, y):
+    q, v = y
+    return _columns(_dot(q, q) - 1, 2 * _dot(q, v))
+
+
+def heavy_top(t, y):
+    q, v = y
+    return _columns(_dot(q, q) - 1, 2 * _dot(q, v))
+
+
+def rolling_disc(t, y):
+    q, v = y
+    speed = 0.5 * v[..., 3]
+    return _columns(v[..., 0] - speed * np.cos(q[..., 2]), v[..., 1] - speed * np.sin(q[..., 2]))

@@ -5,6 +5,7 @@ from decimal import Decimal
 
 import diffrax as dfx
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from typer.testing import CliRunner
@@ -12,7 +13,7 @@ from typer.testing import CliRunner
 import manifold_jax as mj
 from manifold_jax import problems
 from manifold_jax._cli import app
-from manifold_jax._compare import methods, paper, report, with_diffrax
+from manifold_jax._compare import figure, methods, paper, report, with_diffrax
 from manifold_jax._compare.task import SolveFailed, Task
 
 
@@ -33,11 +34,9 @@ def run(*arguments):
     return CliRunner().invoke(app, [str(argument) for argument in arguments])
 
 
-def only(monkeypatch, *labels):
-    """The methods with these labels alone, in place of the whole registry."""
-    chosen = tuple(method for method in methods.METHODS if method.label in labels)
-    assert len(chosen) == len(labels)
-    monkeypatch.setattr(methods, "METHODS", chosen)
+def method(key):
+    (chosen,) = (method for method in methods.METHODS if method.key == key)
+    return chosen
 
 
 def strict_json(path):
@@ -95,10 +94,14 @@ def test_compare_writes_the_table_as_json(comparison):
     assert settings["solver"] == "tsit5"
     assert (settings["rtol"], settings["atol"]) == (1e-5, 1e-6)
     assert (settings["t0"], settings["t1"]) == (0.0, 30.0)
+    assert settings["gain"] == 1.0
     assert settings["max_steps"] == 4096
     assert settings["output_points"] == 1001
     assert settings["failures"] == {}
-    names = ["plain tsit5", "projected tsit5", "scipy RK45", "scipy DOP853", "scipy LSODA"]
+    assert settings["left_out"] == {"baumgarte tsit5": "needs a mechanical system"}
+    approaches = ["plain", "projected", "one-step", "invariant", "exact", "tangent", "partition"]
+    names = [f"{approach} tsit5" for approach in approaches]
+    names += ["scipy RK45", "scipy DOP853", "scipy LSODA"]
     assert [row["method"] for row in content["rows"]] == names
     assert all(set(row) == ROW_KEYS for row in content["rows"])
 
@@ -113,11 +116,15 @@ def test_compare_knows_every_number_that_can_be_known(comparison):
         assert row["error"] < 1e-3
 
 
-def test_compare_shows_the_constraint_kept_by_projection_only(comparison):
+def test_compare_shows_which_methods_keep_the_constraint(comparison):
     rows = rows_of(comparison)
-    projected = rows.pop("projected tsit5")
-    assert projected["violation_steps"] <= 1e-12
-    assert projected["violation_output"] <= 1e-12
+    for name in ("projected tsit5", "tangent tsit5", "partition tsit5"):
+        row = rows.pop(name)
+        assert row["violation_steps"] <= 1e-12
+        assert row["violation_output"] <= 1e-12
+    one_step = rows.pop("one-step tsit5")
+    assert 1e-14 < one_step["violation_steps"] <= 1e-9
+    assert 1e-14 < one_step["violation_output"] <= 1e-9
     for row in rows.values():
         assert row["violation_steps"] > 1e-8
         assert row["violation_output"] > 1e-8
@@ -133,6 +140,8 @@ def test_compare_prints_what_it_writes(comparison):
         assert cells[4] == f"{row['violation_output']:.1e}"
         assert cells[5] == f"{row['error']:.1e}"
     assert "Step limit chosen for Diffrax: 4096" in result.stdout
+    assert "(invariant, exact) with gain 1 per unit of time" in result.stdout
+    assert "Left out: baumgarte tsit5, which needs a mechanical system" in result.stdout
 
 
 def test_compare_draws_a_picture(comparison):
@@ -141,13 +150,25 @@ def test_compare_draws_a_picture(comparison):
     assert len(content) > 20_000
 
 
-@pytest.mark.parametrize("method", ["plain tsit5", "projected tsit5"])
-def test_compare_numbers_are_those_of_a_solve_by_hand(comparison, method):
-    row = rows_of(comparison)[method]
+# of the rigid body, with the gain 1 that is the default there
+BY_HAND = {
+    "plain": lambda solver, constraint: solver,
+    "projected": mj.Projected,
+    "exact": lambda solver, constraint: mj.Stabilized(
+        solver, constraint, stabilization=mj.ExactStabilization(1.0)
+    ),
+    "partition": lambda solver, constraint: mj.LocalCoordinates(
+        solver, constraint, chart=mj.CoordinatePartitionChart()
+    ),
+}
+
+
+@pytest.mark.parametrize("approach", BY_HAND)
+def test_compare_numbers_are_those_of_a_solve_by_hand(comparison, approach):
+    row = rows_of(comparison)[f"{approach} tsit5"]
     problem = problems.rigid_body()
-    solver, solve = dfx.Tsit5(), dfx.diffeqsolve
-    if method.startswith("projected"):
-        solver, solve = mj.Projected(solver, problem.constraint), mj.diffeqsolve
+    solver = BY_HAND[approach](dfx.Tsit5(), problem.constraint)
+    solve = dfx.diffeqsolve if approach == "plain" else mj.diffeqsolve
     calls = []
 
     def field(t, y, args):
@@ -179,25 +200,65 @@ def test_compare_numbers_are_those_of_a_solve_by_hand(comparison, method):
     assert row["error"] == pytest.approx(error, rel=1e-6)
 
 
+def test_compare_baumgarte_is_that_of_a_system_built_by_hand(tmp_path):
+    path = tmp_path / "rows.json"
+    arguments = ("--methods", "baumgarte", "--gain", "2", "--json", path)
+    result = run("compare", "pendulum", *arguments)
+    assert "(baumgarte) with gain 2 per unit of time" in result.stdout
+    content = strict_json(path)
+    assert content["settings"]["gain"] == 2.0
+    (row,) = content["rows"]
+    assert row["method"] == "baumgarte tsit5"
+    system = mj.MechanicalSystem(
+        1.0,
+        lambda t, q, args: q @ q - 1.0,
+        lambda t, q, v, args: jnp.array([0.0, -9.81]),
+        stabilization=mj.Baumgarte(2.0, 2.0),
+    )
+    sol = dfx.diffeqsolve(
+        system.terms,
+        dfx.Tsit5(),
+        0.0,
+        10.0,
+        None,
+        (jnp.array([1.0, 0.0]), jnp.zeros(2)),
+        saveat=dfx.SaveAt(ts=jnp.linspace(0, 10, 1001)),
+        stepsize_controller=dfx.PIDController(rtol=1e-6, atol=1e-6),
+    )
+    assert row["accepted"] == sol.stats["num_accepted_steps"]
+    q, v = sol.ys
+    violation = np.max(np.abs([np.sum(q * q, axis=1) - 1, 2 * np.sum(q * v, axis=1)]))
+    assert row["violation_output"] == pytest.approx(violation, rel=1e-4)
+
+
+def test_compare_runs_the_methods_asked_for_in_the_order_of_the_table(tmp_path):
+    path = tmp_path / "rows.json"
+    arguments = ("--methods", "SciPy-LSODA, scipy-rk45,scipy-rk45", "--json", path)
+    result = run("compare", "harmonic-oscillator", *arguments)
+    assert [row["method"] for row in strict_json(path)["rows"]] == ["scipy RK45", "scipy LSODA"]
+    assert strict_json(path)["settings"]["left_out"] == {}
+    for absent in ("plain", "Stabilization", "Left out", "Step limit"):
+        assert absent not in result.stdout
+
+
 def test_violations_are_absolute_and_the_largest_of_all_equations():
-    task = Task(problems.pendulum(), "tsit5", 1e-6, 1e-6, 10.0)
+    task = Task(problems.pendulum(), "tsit5", 1e-6, 1e-6, 10.0, 3.0)
     rows = np.array([[1.0, 0.0, 0.0, 2.0], [0.5, 0.0, 0.1, 0.0], [1.1, 0.0, -3.0, 0.0]])
     violations = task.violations(np.zeros(3), rows)
-    assert violations == pytest.approx([0.0, 0.75, 3.3], rel=1e-15)
+    assert violations == pytest.approx([0.0, 0.75, 6.6], rel=1e-15)
 
 
 def test_compare_counts_evaluations_of_explicit_methods_without_a_reused_stage():
     # two stages, both anew in each step, and two more to choose the first step
-    task = Task(problems.harmonic_oscillator(), "heun", 1e-3, 1e-3, 1.0)
-    row = methods.measure(task, methods.METHODS[1]).row
+    task = Task(problems.harmonic_oscillator(), "heun", 1e-3, 1e-3, 1.0, 3.0)
+    row = methods.measure(task, method("projected")).row
     assert row.evaluations == 2 * (row.accepted + row.rejected) + 2
 
 
-def test_compare_counts_evaluations_of_implicit_methods(monkeypatch, tmp_path):
-    only(monkeypatch, "plain {solver}")
+def test_compare_counts_evaluations_of_implicit_methods(tmp_path):
     path = tmp_path / "rows.json"
-    arguments = ("--solver", "Kvaerno3", "--rtol", "1e-3", "--t1", "1", "--json", path)
-    assert run("compare", "jay2", *arguments).exit_code == 0
+    arguments = ("--solver", "Kvaerno3", "--rtol", "1e-3", "--t1", "1", "--methods", "plain")
+    assert run("compare", "jay2", *arguments, "--json", path).exit_code == 0
     (row,) = strict_json(path)["rows"]
     assert row["method"] == "plain kvaerno3"
     # three implicit stages with at least one Newton iteration each
@@ -206,9 +267,8 @@ def test_compare_counts_evaluations_of_implicit_methods(monkeypatch, tmp_path):
 
 def test_compare_doubles_the_step_limit_until_the_solve_finishes(monkeypatch, tmp_path):
     monkeypatch.setattr(with_diffrax, "FIRST_MAX_STEPS", 4)
-    only(monkeypatch, "plain {solver}")
     path = tmp_path / "rows.json"
-    result = run("compare", "harmonic-oscillator", "--json", path)
+    result = run("compare", "harmonic-oscillator", "--methods", "plain", "--json", path)
     content = strict_json(path)
     limit, (row,) = content["settings"]["max_steps"], content["rows"]
     assert math.log2(limit / 4).is_integer()
@@ -231,10 +291,10 @@ def test_compare_reports_failures_in_their_row(monkeypatch, tmp_path):
         methods,
         "METHODS",
         (
-            methods.METHODS[0],
+            method("plain"),
             methods.Method("broken", broken),
             methods.Method("hopeless", hopeless),
-            methods.METHODS[2],
+            method("scipy-rk45"),
         ),
     )
     path, picture = tmp_path / "rows.json", tmp_path / "picture.svg"
@@ -253,29 +313,37 @@ def test_compare_reports_failures_in_their_row(monkeypatch, tmp_path):
     assert "<svg" in picture.read_text()
 
 
-def test_compare_does_not_invent_errors_at_times_without_a_known_solution(monkeypatch, tmp_path):
-    only(monkeypatch, "scipy RK45")
+def test_compare_does_not_invent_errors_at_times_without_a_known_solution(tmp_path):
     path, picture = tmp_path / "rows.json", tmp_path / "picture.png"
-    standard = run("compare", "lotka-volterra", "--json", path, "--plot", picture)
+    common = ("compare", "lotka-volterra", "--methods", "scipy-rk45", "--json", path)
+    standard = run(*common, "--plot", picture)
     assert 0 < strict_json(path)["rows"][0]["error"] < 1e-3
     assert "known at t = 10 only" in standard.stdout
-    other = run("compare", "lotka-volterra", "--t1", "5", "--json", path, "--plot", picture)
+    other = run(*common, "--t1", "5", "--plot", picture)
     assert strict_json(path)["settings"]["t1"] == 5
     assert strict_json(path)["rows"][0]["error"] is None
     assert "not known for this time span" in other.stdout
 
 
-def test_compare_draws_every_kind_of_state(monkeypatch, tmp_path):
-    only(monkeypatch, "scipy DOP853")
+def test_compare_draws_every_kind_of_state(tmp_path):
     for name in ("pendulum", "rotation", "car-axis"):
         picture = tmp_path / f"{name}.png"
-        assert run("compare", name, "--plot", picture).exit_code == 0
+        arguments = ("--methods", "scipy-dop853", "--plot", picture)
+        assert run("compare", name, *arguments).exit_code == 0
         assert picture.stat().st_size > 20_000
 
 
 @pytest.mark.parametrize("solver", with_diffrax.SOLVERS)
 def test_every_solver_is_in_the_help(solver):
     assert solver in re.findall(r"\w+", run("compare", "--help").stdout)
+
+
+def test_every_method_is_in_the_help_and_has_a_style():
+    text = run("compare", "--help").stdout
+    for method in methods.METHODS:
+        assert method.key in re.findall(r"[\w-]+", text)
+        assert method.key in figure.STYLES
+    assert len({str(style) for style in figure.STYLES.values()}) == len(methods.METHODS)
 
 
 # errors
@@ -290,6 +358,10 @@ def test_every_solver_is_in_the_help(solver):
         (("pendulum", "--rtol", "0"), "must be a positive number, got 0.0"),
         (("pendulum", "--atol", "-1e-6"), "must be a positive number, got -1e-06"),
         (("pendulum", "--atol", "nan"), "must be a positive number, got nan"),
+        (("pendulum", "--gain", "0"), "must be a positive number, got 0.0"),
+        (("pendulum", "--methods", "plain,rattle"), "there is no method 'rattle'. Choose one of"),
+        (("pendulum", "--methods", ""), "partition, scipy-rk45, scipy-dop853, scipy-lsoda"),
+        (("kepler", "--methods", "baumgarte"), "mechanical system, which `kepler` is not"),
         (("pendulum", "--t1", "0"), "must be later than the start of `pendulum`, t0 = 0"),
         (("arevalo", "--t1", "0.5"), "t0 = 1; got 0.5"),
         (("pendulum", "--plot", "picture.gif"), "must end in one of: .png"),

@@ -43,14 +43,19 @@ def pendulum():
     return problem, problem.constraint, 3.0
 
 
-def fitted_order(solver, counts, problem, constraint, end):
+def double_pendulum():
+    problem = mj.problems.double_pendulum()
+    return problem, problem.constraint, 1.5
+
+
+def fitted_order(solver, counts, problem, constraint, end, hook=mj.Projected):
     """Least-squares slope of log(error) against log(step), errors in 1e-11 .. 1e-2."""
-    projected = mj.Projected(solver, constraint)
+    hooked = hook(solver, constraint)
 
     @jax.jit
     def solve(dt0):
         sol = mj.diffeqsolve(
-            problem.terms, projected, 0.0, end, dt0, problem.y0, problem.args, max_steps=140000
+            problem.terms, hooked, 0.0, end, dt0, problem.y0, problem.args, max_steps=140000
         )
         return jfu.ravel_pytree(sol.ys)[0]
 
@@ -68,7 +73,50 @@ def test_order(name, make):
     solver, order, counts = METHODS[name]
     slope, errors = fitted_order(solver, counts, *make())
     print(f"{name:9s} {make.__name__:12s} slope {slope:.3f}  errors {errors}")
+    check(name, slope, order)
+
+
+def check(name, slope, order):
     if name == "Dopri8":
         assert 7.5 <= slope <= 9
     else:
         assert abs(slope - order) <= 0.2
+
+
+HOOKS = {
+    "projected": mj.Projected,
+    "tangent": mj.LocalCoordinates,
+    "partition": lambda solver, constraint: mj.LocalCoordinates(
+        solver, constraint, chart=mj.CoordinatePartitionChart()
+    ),
+    "invariant": lambda solver, constraint: mj.Stabilized(
+        solver, constraint, stabilization=mj.InvariantStabilization(2.0)
+    ),
+    "exact": lambda solver, constraint: mj.Stabilized(
+        solver, constraint, stabilization=mj.ExactStabilization(2.0)
+    ),
+}
+PROBLEMS = [sphere_only, pendulum, double_pendulum]
+# One solver for every approach by default, the rest in the slow part.
+QUICK = {("Dopri5", make, hook) for make in (double_pendulum,) for hook in HOOKS}
+CASES = [
+    pytest.param(
+        name,
+        make,
+        hook,
+        marks=() if (name, make, hook) in QUICK else pytest.mark.slow,
+        id=f"{name}-{make.__name__}-{hook}",
+    )
+    for name in ("Bosh3", "Dopri5", "Dopri8")
+    for make in PROBLEMS
+    for hook in HOOKS
+    if hook != "projected" or make is double_pendulum  # the others are above
+]
+
+
+@pytest.mark.parametrize(("name", "make", "hook"), CASES)
+def test_order_of_every_approach(name, make, hook):
+    solver, order, counts = METHODS[name]
+    slope, errors = fitted_order(solver, counts, *make(), HOOKS[hook])
+    print(f"{name:9s} {make.__name__:15s} {hook:10s} slope {slope:.3f}  errors {errors}")
+    check(name, slope, order)

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import jax.tree_util as jtu
 import matplotlib
@@ -14,19 +15,41 @@ from .methods import Measurement
 from .task import Task
 
 
-# Colour-blind safe (Okabe & Ito); black is the reference.
-COLOURS = ("#D55E00", "#0072B2", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
+# Colour-blind safe (Okabe & Ito); related approaches share a hue, black is the solution.
+STYLES: dict[str, tuple[str, Any]] = {
+    "plain": ("#D55E00", "solid"),
+    "projected": ("#0072B2", "solid"),
+    "one-step": ("#56B4E9", "dashed"),
+    "invariant": ("#009E73", "solid"),
+    "exact": ("#009E73", "dashed"),
+    "baumgarte": ("#E69F00", "solid"),
+    "tangent": ("#CC79A7", "solid"),
+    "partition": ("#CC79A7", "dashed"),
+    "scipy-rk45": ("#555555", "dotted"),
+    "scipy-dop853": ("#888888", "dotted"),
+    "scipy-lsoda": ("#BBBBBB", "dotted"),
+}
 # A violation or an error of exactly zero is drawn here.
 FLOOR = 1e-17
+# Curves show the largest value in each of so many intervals: rounding errors and changes of
+# sign would fill the panels.
+INTERVALS = 100
+
+
+class _Solved(NamedTuple):
+    """A measurement and how it is drawn."""
+
+    measurement: Measurement
+    style: dict[str, Any]
 
 
 def write_figure(path: Path, task: Task, measurements: Sequence[Measurement]) -> None:
     matplotlib.use("Agg")
-    figure = Figure(figsize=(13, 4.2), layout="constrained")
+    figure = Figure(figsize=(13, 4.8), layout="constrained")
     shape = np.shape(jtu.tree_leaves(task.problem.y0)[0])
     first = figure.add_subplot(1, 3, 1, projection="3d" if shape == (3,) else None)
     second, third = figure.add_subplot(1, 3, 2), figure.add_subplot(1, 3, 3)
-    solved = [(COLOURS[i % len(COLOURS)], m) for i, m in enumerate(measurements) if not m.failure]
+    solved = [_Solved(m, _style(m.key)) for m in measurements if not m.failure]
     if shape in ((2,), (3,)):
         _draw_path(first, task, solved, shape[0])
     else:
@@ -35,21 +58,26 @@ def write_figure(path: Path, task: Task, measurements: Sequence[Measurement]) ->
     _draw_errors(third, task, solved)
     figure.legend(
         lines,
-        [m.row.method for _, m in solved],
+        [s.measurement.row.method for s in solved],
         loc="outside lower center",
-        ncols=max(len(solved), 1),
+        ncols=min(max(len(solved), 1), 6),
         frameon=False,
     )
     figure.suptitle(f"{task.problem.name}, rtol = {task.rtol:g}, atol = {task.atol:g}")
     figure.savefig(path, dpi=150)
 
 
-def _draw_path(axes: Axes, task: Task, solved: Sequence, dimension: int) -> None:
+def _style(key: str) -> dict[str, Any]:
+    colour, line = STYLES[key]
+    return dict(color=colour, linestyle=line, linewidth=1.2, zorder=1 if "scipy" in key else 2)
+
+
+def _draw_path(axes: Axes, task: Task, solved: Sequence[_Solved], dimension: int) -> None:
     """The first leaf as a curve in the plane or in space."""
     # Nested, the first the widest: usually the curves are the same to the eye.
-    for i, (colour, measurement) in enumerate(solved):
-        width = 1 + 1.2 * (len(solved) - 1 - i)
-        axes.plot(*measurement.states[:, :dimension].T, color=colour, linewidth=width)
+    for i, (measurement, style) in enumerate(solved):
+        width = 1 + 0.7 * (len(solved) - 1 - i)
+        axes.plot(*measurement.states[:, :dimension].T, color=style["color"], linewidth=width)
     known = task.reference()
     if known is not None:
         curve = known[1][:, :dimension].T
@@ -69,7 +97,7 @@ def _draw_path(axes: Axes, task: Task, solved: Sequence, dimension: int) -> None
         axes.set_aspect("equal", adjustable="datalim")
 
 
-def _draw_components(axes: Axes, task: Task, solved: Sequence, count: int) -> None:
+def _draw_components(axes: Axes, task: Task, solved: Sequence[_Solved], count: int) -> None:
     """The first leaf over time, if it has too many components for a curve.
 
     Of one method only, as the lines of several could not be told apart; the other panels
@@ -77,37 +105,46 @@ def _draw_components(axes: Axes, task: Task, solved: Sequence, count: int) -> No
     """
     if not solved:
         return
-    _, measurement = next((s for s in solved if s[1].row.method.startswith("projected")), solved[0])
+    measurement, _ = next((s for s in solved if s.measurement.key == "projected"), solved[0])
     colours = matplotlib.colormaps["viridis"](np.linspace(0, 0.9, count))
     for i in range(count):
         axes.plot(task.grid, measurement.states[:, i], color=colours[i], linewidth=1)
     axes.set(xlabel="$t$", title=f"components, {measurement.row.method}")
 
 
-def _draw_violations(axes: Axes, task: Task, solved: Sequence) -> list:
+def _draw_violations(axes: Axes, task: Task, solved: Sequence[_Solved]) -> list:
     lines = []
-    for colour, m in solved:
-        values = np.maximum(m.violations, FLOOR)
-        lines += axes.semilogy(task.grid, values, color=colour, linewidth=1)
+    for m, style in solved:
+        lines += axes.semilogy(*_largest_in_intervals(task.grid, m.violations), **style)
     axes.set(xlabel="$t$", title="violation, max $|g|$")
     axes.grid(alpha=0.3)
     return lines
 
 
-def _draw_errors(axes: Axes, task: Task, solved: Sequence) -> None:
+def _draw_errors(axes: Axes, task: Task, solved: Sequence[_Solved]) -> None:
     axes.grid(alpha=0.3)
     axes.set(xlabel="$t$", title="error of the state, max norm")
     if task.reference() is None:
         note = "solution not known\nfor this time span"
         axes.text(0.5, 0.5, note, ha="center", va="center", transform=axes.transAxes)
     elif task.problem.reference_at_end_only:
-        for i, (colour, m) in enumerate(solved):
-            axes.semilogy(i, max(m.row.error, FLOOR), "o", color=colour, markersize=8)
-        axes.set(xlabel="", xticks=[], xlim=(-1, len(solved)))
+        for i, (m, style) in enumerate(solved):
+            axes.semilogy(i, max(m.row.error, FLOOR), "o", color=style["color"], markersize=8)
+        names = [m.key for m, _ in solved]
+        axes.set(xlabel="", xlim=(-1, len(solved)))
+        axes.set_xticks(range(len(solved)), names, rotation=90, fontsize="small")
         axes.set_title(f"error of the state at t = {task.t1:g}, max norm")
     elif solved:
-        for colour, m in solved:
-            axes.semilogy(m.error_times, np.maximum(m.errors, FLOOR), color=colour, linewidth=1)
+        curves = [_largest_in_intervals(m.error_times, m.errors) for m, _ in solved]
+        for curve, (_, style) in zip(curves, solved, strict=True):
+            axes.semilogy(*curve, **style)
         # The start is exact: seen in full, it would press everything else together.
-        errors = np.concatenate([m.errors for _, m in solved])
+        errors = np.concatenate([errors for _, errors in curves])
         axes.set_ylim(bottom=max(np.quantile(errors, 0.01) / 10, FLOOR))
+
+
+def _largest_in_intervals(times: Any, values: Any) -> tuple[np.ndarray, np.ndarray]:
+    """The middles of the intervals, and the largest value in each."""
+    middles = [np.mean(part) for part in np.array_split(times, INTERVALS)]
+    largest = [np.max(part) for part in np.array_split(values, INTERVALS)]
+    return np.array(middles), np.maximum(largest, FLOOR)

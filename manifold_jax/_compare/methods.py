@@ -2,12 +2,13 @@
 
 import dataclasses
 import functools
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 
 import numpy as np
 
+from .approaches import APPROACHES
 from .task import Run, SolveFailed, Task
-from .with_diffrax import run_plain, run_projected
+from .with_diffrax import run_diffrax
 from .with_scipy import run_scipy
 
 
@@ -17,19 +18,35 @@ class Method:
 
     - `label`: its name in tables, in which `{solver}` is the Diffrax solver asked for.
     - `run`: solves a task; raises `SolveFailed` if it cannot.
+    - `needs_system`: whether it is for mechanical systems only.
     """
 
     label: str
     run: Callable[[Task], Run]
+    needs_system: bool = False
+
+    @property
+    def key(self) -> str:
+        """Its name on the command line: `plain`, `scipy-rk45`."""
+        return self.label.removesuffix(" {solver}").replace(" ", "-").lower()
 
     def name(self, task: Task) -> str:
         return self.label.format(solver=task.solver)
 
+    def applies_to(self, task: Task) -> bool:
+        return task.problem.system is not None or not self.needs_system
+
 
 # In the order of the tables.
 METHODS: tuple[Method, ...] = (
-    Method("plain {solver}", run_plain),
-    Method("projected {solver}", run_projected),
+    *(
+        Method(
+            f"{approach.name} {{solver}}",
+            functools.partial(run_diffrax, approach=approach),
+            approach.needs_system,
+        )
+        for approach in APPROACHES
+    ),
     Method("scipy RK45", functools.partial(run_scipy, method="RK45")),
     Method("scipy DOP853", functools.partial(run_scipy, method="DOP853")),
     Method("scipy LSODA", functools.partial(run_scipy, method="LSODA")),
@@ -63,6 +80,7 @@ class Measurement:
     known. After a failed solve only `failure`, the reason, is set.
     """
 
+    key: str
     row: Row
     failure: str | None = None
     max_steps: int | None = None
@@ -72,24 +90,18 @@ class Measurement:
     errors: np.ndarray | None = None
 
 
-def measure_all(task: Task) -> Iterator[tuple[str, Callable[[], Measurement]]]:
-    """Name and measurement of each method, to be called one after the other."""
-    for method in METHODS:
-        yield method.name(task), functools.partial(measure, task, method)
-
-
 def measure(task: Task, method: Method) -> Measurement:
     """Solve the task with one method; a failure is a result, too."""
-    name = method.name(task)
+    key, name = method.key, method.name(task)
     try:
         run = method.run(task)
         if not (np.all(np.isfinite(run.output)) and np.all(np.isfinite(run.steps))):
             raise SolveFailed("the solution is not finite")
     except SolveFailed as error:
-        return Measurement(Row(name), failure=str(error))
+        return Measurement(key, Row(name), failure=str(error))
     except Exception as error:  # of a library: the other methods are still of interest
         reason = str(error).strip().partition("\n")[0]
-        return Measurement(Row(name), failure=f"{type(error).__name__}: {reason}")
+        return Measurement(key, Row(name), failure=f"{type(error).__name__}: {reason}")
     violations = task.violations(task.grid, run.output)
     error_times, errors = _errors(task, run)
     row = Row(
@@ -104,6 +116,7 @@ def measure(task: Task, method: Method) -> Measurement:
         compile_s=run.compile_s,
     )
     return Measurement(
+        key,
         row,
         max_steps=run.max_steps,
         states=run.output,

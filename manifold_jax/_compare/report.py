@@ -20,8 +20,13 @@ from rich.table import Table
 
 from .. import __version__
 from ..problems import Problem
-from .methods import Measurement
+from .methods import Measurement, Method
 from .task import OUTPUT_POINTS, Task
+
+
+# The methods for which the gain is.
+STABILIZATIONS = ("invariant", "exact", "baumgarte")
+NEEDS_SYSTEM = "needs a mechanical system"
 
 
 def sizes(problem: Problem) -> tuple[int, int]:
@@ -96,7 +101,9 @@ def _number(value: int | float | None, fmt: str) -> str:
     return "-" if value is None else format(value, fmt)
 
 
-def comparison_notes(task: Task, measurements: Sequence[Measurement]) -> list[str]:
+def comparison_notes(
+    task: Task, measurements: Sequence[Measurement], left_out: Sequence[Method]
+) -> list[str]:
     """How to read the table, below it."""
     if task.reference() is None:
         known = "is not known for this time span (without --t1 it is)"
@@ -109,6 +116,14 @@ def comparison_notes(task: Task, measurements: Sequence[Measurement]) -> list[st
         "Run: median, output included. SciPy calls the compiled field from Python and does not "
         "report rejected steps.",
     ]
+    stabilized = [m.key for m in measurements if m.key in STABILIZATIONS]
+    if stabilized:
+        notes.append(
+            f"Stabilization ({', '.join(stabilized)}) with gain {task.gain:.3g} per unit of time; "
+            "its states are handed out uncorrected."
+        )
+    for method in left_out:
+        notes.append(f"Left out: {method.name(task)}, which {NEEDS_SYSTEM}.")
     limit = max_steps(measurements)
     return notes if limit is None else [*notes, f"Step limit chosen for Diffrax: {limit}."]
 
@@ -119,13 +134,16 @@ def max_steps(measurements: Sequence[Measurement]) -> int | None:
     return max(limits, default=None)
 
 
-def write_json(path: Path, task: Task, measurements: Sequence[Measurement]) -> None:
+def write_json(
+    path: Path, task: Task, measurements: Sequence[Measurement], left_out: Sequence[Method]
+) -> None:
     """Everything in the table and how it was made. Unknown numbers are null."""
     n, m = sizes(task.problem)
     settings = {
         "solver": task.solver,
         "rtol": task.rtol,
         "atol": task.atol,
+        "gain": task.gain,
         "t0": task.t0,
         "t1": task.t1,
         "output_points": OUTPUT_POINTS,
@@ -141,6 +159,7 @@ def write_json(path: Path, task: Task, measurements: Sequence[Measurement]) -> N
             "scipy": scipy.__version__,
         },
         "failures": {m.row.method: m.failure for m in measurements if m.failure is not None},
+        "left_out": {method.name(task): NEEDS_SYSTEM for method in left_out},
     }
     rows = [vars(measurement.row) for measurement in measurements]
     content = {"problem": task.problem.name, "settings": settings, "rows": rows}

@@ -24,6 +24,8 @@ class SolveFailed(Exception):
 class Task:
     """A problem of the gallery with the settings that all methods share.
 
+    `gain` (1/time) is that of the methods that stabilize.
+
     States are rows of arrays `(times, n)` here, the leaves of `y` one after another, so
     that all libraries are treated alike.
     """
@@ -33,6 +35,7 @@ class Task:
     rtol: float
     atol: float
     t1: float
+    gain: float
 
     @property
     def t0(self) -> float:
@@ -74,7 +77,7 @@ class Run:
 
     - `output`: states on the output grid, `(OUTPUT_POINTS, n)`.
     - `step_times`, `steps`: the ends of the accepted steps and the states there.
-    - `run_ms`: median run time, output on the grid included; `compile_s`: tracing and
+    - `run_ms`: median run time, output on the grid and steps included; `compile_s`: tracing and
         compiling the same program.
     - `max_steps`: the limit under which it ran.
     """

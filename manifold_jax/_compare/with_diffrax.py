@@ -1,4 +1,4 @@
-"""Diffrax's solvers, plain and wrapped by this library."""
+"""Diffrax's solvers, plain and in the approaches of this library."""
 
 import time
 from collections.abc import Callable
@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._diffeqsolve import diffeqsolve
-from .._solver import Projected
+from .approaches import Approach, Formulation, with_vector_field
 from .task import as_rows, Run, SolveFailed, Task
 from .timing import median_ms
 
@@ -39,18 +39,6 @@ FIRST_MAX_STEPS = 4096
 LAST_MAX_STEPS = 2**20
 
 
-class _Solve(NamedTuple):
-    """How a task is solved.
-
-    - `function`, `solver`: the function that solves, and what to pass to it.
-    - `extra_evaluations`: of the vector field, before the solver starts.
-    """
-
-    function: Callable[..., dfx.Solution]
-    solver: dfx.AbstractSolver
-    extra_evaluations: int
-
-
 class _Outcome(NamedTuple):
     ts: Any
     ys: Any
@@ -58,20 +46,12 @@ class _Outcome(NamedTuple):
     result: dfx.RESULTS
 
 
-def run_plain(task: Task) -> Run:
-    """`diffrax.diffeqsolve` with the solver as it is."""
-    return _run(task, _Solve(dfx.diffeqsolve, SOLVERS[task.solver](), 0))
-
-
-def run_projected(task: Task) -> Run:
-    """`mj.diffeqsolve` with the solver projected."""
-    solver = Projected(SOLVERS[task.solver](), task.problem.constraint)
-    # two evaluations choose the first step (Diffrax starts with 0.01 whatever the problem)
-    return _run(task, _Solve(diffeqsolve, solver, 2))
-
-
-def _run(task: Task, solve: _Solve) -> Run:
-    saveat, max_steps = dfx.SaveAt(ts=jnp.asarray(task.grid)), FIRST_MAX_STEPS
+def run_diffrax(task: Task, approach: Approach) -> Run:
+    """The solver that the task names, within one of the approaches."""
+    solve = approach.formulate(task.problem, SOLVERS[task.solver](), task.gain)
+    # The ends of the steps, too: another program for them would take as long to compile.
+    saveat = dfx.SaveAt(subs=[dfx.SubSaveAt(ts=jnp.asarray(task.grid)), dfx.SubSaveAt(steps=True)])
+    max_steps = FIRST_MAX_STEPS
     program, seconds = _compiled(task, solve, saveat, max_steps)
     outcome = program()
     if outcome.result == dfx.RESULTS.max_steps_reached:
@@ -80,15 +60,19 @@ def _run(task: Task, solve: _Solve) -> Run:
         outcome = program()
     _raise_if_failed(outcome)
     run_ms = median_ms(program)
-    step_times, steps, counted = _steps(task, solve, max_steps)
     stats = {name: int(outcome.stats[f"num_{name}_steps"]) for name in ("accepted", "rejected")}
     evaluations = _explicit_evaluations(task, solve, sum(stats.values()))
+    if evaluations is None:
+        evaluations = _counted_evaluations(task, solve, max_steps)
+    output, steps = outcome.ys
+    step_times = np.asarray(outcome.ts[1])
+    used = np.isfinite(step_times)
     return Run(
-        output=as_rows(outcome.ys),
-        step_times=step_times,
-        steps=steps,
+        output=as_rows(output),
+        step_times=step_times[used],
+        steps=as_rows(steps)[used],
         **stats,
-        evaluations=counted if evaluations is None else evaluations,
+        evaluations=evaluations,
         run_ms=run_ms,
         compile_s=seconds,
         max_steps=max_steps,
@@ -96,18 +80,14 @@ def _run(task: Task, solve: _Solve) -> Run:
 
 
 def _compiled(
-    task: Task,
-    solve: _Solve,
-    saveat: dfx.SaveAt,
-    max_steps: int,
-    terms: dfx.AbstractTerm | None = None,
+    task: Task, solve: Formulation, saveat: dfx.SaveAt, max_steps: int
 ) -> tuple[Callable[[], _Outcome], float]:
     """The program, ready to run to its end, and the seconds it took to trace and compile."""
     problem = task.problem
 
     def run(y0, args):
         sol = solve.function(
-            problem.terms if terms is None else terms,
+            solve.terms,
             solve.solver,
             task.t0,
             task.t1,
@@ -129,7 +109,7 @@ def _compiled(
     return lambda: jax.block_until_ready(program(problem.y0, problem.args)), seconds
 
 
-def _sufficient_max_steps(task: Task, solve: _Solve) -> int:
+def _sufficient_max_steps(task: Task, solve: Formulation) -> int:
     """The first of 4096, 8192, ... with which the solve finishes.
 
     Found by one solve that keeps the end only, as each limit is another program to compile.
@@ -154,36 +134,34 @@ def _raise_if_failed(outcome: _Outcome) -> None:
         raise SolveFailed(dfx.RESULTS[outcome.result] or "failed")
 
 
-def _steps(task: Task, solve: _Solve, max_steps: int) -> tuple[np.ndarray, np.ndarray, int | None]:
-    """Ends of the accepted steps, states there, and the evaluations of the vector field.
-
-    The latter for implicit solvers only, counted as they happen.
-    """
+def _counted_evaluations(task: Task, solve: Formulation, max_steps: int) -> int:
+    """Evaluations of the vector field, counted as they happen."""
     count = 0
 
     def increment():
         nonlocal count
         count += 1
 
-    def counting_field(t, y, args):
-        jax.debug.callback(increment)
-        return task.problem.terms.vf(t, y, args)
+    def counting(field):
+        def counted(t, y, args):
+            jax.debug.callback(increment)
+            return field(t, y, args)
 
-    # A callback takes some 10 us, so that explicit solvers are better off with a formula.
-    implicit = isinstance(SOLVERS[task.solver](), dfx.AbstractImplicitSolver)
-    terms = dfx.ODETerm(counting_field) if implicit else None
-    program, _ = _compiled(task, solve, dfx.SaveAt(steps=True), max_steps, terms)
+        return counted
+
+    solve = solve._replace(terms=with_vector_field(solve.terms, counting))
+    program, _ = _compiled(task, solve, dfx.SaveAt(t1=True), max_steps)
     outcome = program()
     jax.effects_barrier()
     _raise_if_failed(outcome)
-    used = np.isfinite(np.asarray(outcome.ts))
-    return np.asarray(outcome.ts)[used], as_rows(outcome.ys)[used], count if implicit else None
+    return count
 
 
-def _explicit_evaluations(task: Task, solve: _Solve, steps: int) -> int | None:
+def _explicit_evaluations(task: Task, solve: Formulation, steps: int) -> int | None:
     """Evaluations of the vector field by an explicit solver in so many steps, accepted or not.
 
-    The last stage is the first one of the next step if the tableau says so.
+    One for each stage, in every approach; the last stage is the first one of the next step if
+    the tableau says so. (A callback that counts takes some 10 us.)
     """
     solver = SOLVERS[task.solver]()
     if not isinstance(solver, dfx.AbstractERK):
@@ -192,4 +170,5 @@ def _explicit_evaluations(task: Task, solve: _Solve, steps: int) -> int | None:
     assert isinstance(tableau, dfx.ButcherTableau)  # several are for several vector fields
     reused = tableau.fsal and tableau.ssal
     in_steps = 1 + (tableau.num_stages - 1) * steps if reused else tableau.num_stages * steps
-    return in_steps + solve.extra_evaluations
+    # Two evaluations choose the first step (Diffrax starts with 0.01 whatever the problem).
+    return in_steps + (2 if solve.function is diffeqsolve else 0)

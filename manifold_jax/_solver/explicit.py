@@ -11,12 +11,20 @@ from typing import Any
 
 import diffrax as dfx
 import jax
+import jax.extend.core as jax_core
 import jax.numpy as jnp
 import jax.tree_util as jtu
+import numpy as np
 from diffrax import AbstractTerm
+from jaxtyping import Array
 
 from .._custom_types import Args, RealScalarLike, Y
 from .._projection import ProjectionInfo
+
+
+# Equations of the vector field times stages. Beyond it compiling takes longer than the loop
+# costs: a minute for a linkage with eight constraints and a method of thirteen stages.
+LARGEST_UNROLLED = 2000
 
 
 def is_unrollable(solver: dfx.AbstractSolver, terms: Any, t0, t1, y0: Y, args: Args) -> bool:
@@ -61,12 +69,14 @@ def explicit_step(
     if stage_terms is terms:
         at_stage = at_corrected
     fsal = is_first_same_as_last(tableau)
-    rows, nodes = list(tableau.a_lower), [float(c) for c in tableau.c]
-    f, increments = f0, [terms.prod(f0, control)]
-    for row, c in zip(rows[:-1] if fsal else rows, nodes, strict=False):
-        y = _combine(row, increments, y0)
-        f = at_stage(jnp.asarray(t0 + c * (t1 - t0)), y)
-        increments.append(terms.prod(f, control))
+    rows = list(tableau.a_lower)
+    times = [jnp.asarray(t0 + float(c) * (t1 - t0)) for c in tableau.c]
+    f, first = f0, terms.prod(f0, control)
+    inner_rows = rows[:-1] if fsal else rows
+    increment = lambda t, y: terms.prod(at_stage(t, y), control)
+    size = num_equations(jax.make_jaxpr(at_stage)(times[0], y0).jaxpr) * (len(inner_rows) + 1)
+    evaluate = _stages if size <= LARGEST_UNROLLED else _stages_in_a_loop
+    increments = evaluate(inner_rows, times[: len(inner_rows)], increment, y0, first)
     # The last stage of a first-same-as-last method is taken at the new state itself.
     raw = _combine(rows[-1] if fsal else tableau.b_sol, increments, y0)
     y1, info = correct(raw)
@@ -78,6 +88,43 @@ def explicit_step(
     error = _combine(tableau.b_error, increments)
     k = jtu.tree_map(lambda *ks: jnp.stack(ks), *increments)
     return y1, raw, error, dict(y0=y0, y1=raw, k=k), f, info
+
+
+def _stages(rows: list[Any], times: list[Array], increment: Callable, y0: Y, first: Y) -> list[Y]:
+    increments = [first]
+    for row, t in zip(rows, times, strict=True):
+        increments.append(increment(t, _combine(row, increments, y0)))
+    return increments
+
+
+def _stages_in_a_loop(
+    rows: list[Any], times: list[Array], increment: Callable, y0: Y, first: Y
+) -> list[Y]:
+    """The same with the vector field compiled once, whatever the number of stages."""
+    count = len(rows) + 1
+    padded = [np.pad(np.asarray(row, np.float64), (0, count - len(row))) for row in rows]
+    buffer = jtu.tree_map(lambda k: jnp.zeros((count, *k.shape), k.dtype).at[0].set(k), first)
+
+    def stage(buffer: Y, xs: Any) -> tuple[Y, None]:
+        i, t, row = xs
+        sum_up = lambda k, y: y + jnp.tensordot(row.astype(k.dtype), k, axes=1)
+        new = increment(t, jtu.tree_map(sum_up, buffer, y0))
+        return jtu.tree_map(lambda k, n: k.at[i].set(n), buffer, new), None
+
+    xs = jnp.arange(1, count), jnp.stack(times), jnp.asarray(np.stack(padded))
+    buffer, _ = jax.lax.scan(stage, buffer, xs)
+    take = lambda i: jtu.tree_map(lambda k: k[i], buffer)
+    return [take(i) for i in range(count)]
+
+
+def num_equations(jaxpr: Any) -> int:
+    """The length of a traced function, inner functions included."""
+    total = 0
+    for equation in jaxpr.eqns:
+        total += 1
+        for inner in jax_core.jaxprs_in_params(equation.params):
+            total += num_equations(inner)
+    return total
 
 
 def _combine(weights: Any, increments: list[Y], start: Y | None = None) -> Y:

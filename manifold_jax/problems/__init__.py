@@ -8,13 +8,20 @@ from collections.abc import Callable
 
 from ._problem import Problem as Problem
 from .car_axis import car_axis as car_axis
+from .chain import chain as chain, double_pendulum as double_pendulum
+from .four_bar import four_bar as four_bar
+from .heavy_top import heavy_top as heavy_top
 from .kepler import kepler as kepler
 from .lotka_volterra import lotka_volterra as lotka_volterra
 from .matrix_flows import rotation as rotation, sphere_flow as sphere_flow
 from .oscillator import harmonic_oscillator as harmonic_oscillator
+from .parallelogram import parallelogram as parallelogram
 from .pendulum import pendulum as pendulum
 from .rigid_body import rigid_body as rigid_body
+from .rolling_disc import rolling_disc as rolling_disc
+from .slider_crank import slider_crank as slider_crank
 from .small_daes import arevalo as arevalo, jay2 as jay2, skate as skate
+from .spherical_pendulum import spherical_pendulum as spherical_pendulum
 
 
 ALL: dict[str, Callable[[], Problem]] = {
@@ -29,4 +36,12 @@ ALL: dict[str, Callable[[], Problem]] = {
     "skate": skate,
     "sphere-flow": sphere_flow,
     "rotation": rotation,
+    "double-pendulum": double_pendulum,
+    "chain": chain,
+    "slider-crank": slider_crank,
+    "four-bar": four_bar,
+    "parallelogram": parallelogram,
+    "spherical-pendulum": spherical_pendulum,
+    "heavy-top": heavy_top,
+    "rolling-disc": rolling_disc,
 }

@@ -12,6 +12,7 @@ import numpy as np
 
 from .._constraint import AbstractConstraint
 from .._custom_types import Args, Y
+from .._mechanics import MechanicalSystem
 
 
 class Problem(eqx.Module):
@@ -26,6 +27,7 @@ class Problem(eqx.Module):
     - `name`: the name on the command line, e.g. `"rigid-body"`.
     - `terms`: the vector field, a `diffrax.ODETerm`.
     - `constraint`: the manifold.
+    - `system`: the [`MechanicalSystem`][] both belong to, or `None` if it is none.
     - `y0`: the initial state at `t0`, on the manifold.
     - `t0`, `t1`: the time span.
     - `args`: named tuple of the physical parameters, or `None` if there are none. Pass
@@ -36,38 +38,41 @@ class Problem(eqx.Module):
     name: str = eqx.field(static=True)
     terms: diffrax.AbstractTerm
     constraint: AbstractConstraint
+    system: MechanicalSystem | None
     y0: Y
     t0: float
     t1: float
     args: Args
     start: Y | None
     _initial_state: Callable[[Any, Any], Y] = eqx.field(static=True)
-    _make_constraint: Callable[[Any, Y], AbstractConstraint] = eqx.field(static=True)
+    _make_constraint: Callable[[Any, Y], AbstractConstraint] | None = eqx.field(static=True)
     _exact: Callable[[np.ndarray, Any, Any], Any] = eqx.field(static=True)
     _at_end_only: bool = eqx.field(static=True)
 
     def __init__(
         self,
         name: str,
-        terms: diffrax.AbstractTerm,
+        terms: diffrax.AbstractTerm | None = None,
         *,
+        system: MechanicalSystem | None = None,
         t0: float = 0.0,
         t1: float,
         args: Args = None,
         start: Y | None = None,
         y0: Y | None = None,
         initial_state: Callable[[Any, Any], Y],
-        make_constraint: Callable[[Any, Y], AbstractConstraint],
+        make_constraint: Callable[[Any, Y], AbstractConstraint] | None = None,
         exact: Callable[[np.ndarray, Any, Any], Any],
         at_end_only: bool = False,
     ):
         """**Arguments:**
 
-        - `name`, `terms`, `t0`, `t1`, `args`, `start`: as above.
+        - `name`, `terms`, `system`, `t0`, `t1`, `args`, `start`: as above. A `system`
+            provides its own `terms` and constraint.
         - `y0`: the initial state, by default `initial_state(args, start)`.
         - `initial_state`: `(args, start) -> y0`, where `start` is `None` for the
             standard start.
-        - `make_constraint`: `(args, y0) -> constraint`.
+        - `make_constraint`: `(args, y0) -> constraint`, where there is no `system`.
         - `exact`: `(t, args, y0) -> y` in NumPy, `t` of shape `(times,)`; the leaves of
             `y` get that leading axis. Raises `ValueError` where it does not hold.
         - `at_end_only`: whether `exact` knows `t1` alone.
@@ -75,14 +80,19 @@ class Problem(eqx.Module):
         The callables must be functions of a module: they are compared when compiled
         code is looked up.
         """
+        assert (system is None) == (terms is not None and make_constraint is not None)
         self.name = name
-        self.terms = terms
+        self.system = system
+        self.terms = terms if system is None else system.terms
         self.t0 = t0
         self.t1 = t1
         self.args = jtu.tree_map(as_floating, args)
         self.start = jtu.tree_map(as_floating, start)
         self.y0 = initial_state(self.args, self.start) if y0 is None else y0
-        self.constraint = make_constraint(self.args, self.y0)
+        if system is None:
+            self.constraint = make_constraint(self.args, self.y0)  # pyright: ignore
+        else:
+            self.constraint = system.constraint
         self._initial_state = initial_state
         self._make_constraint = make_constraint
         self._exact = exact
@@ -149,7 +159,8 @@ class Problem(eqx.Module):
     def _rebuild(self, *, args: Args, start: Y | None, y0: Y | None) -> "Problem":
         return Problem(
             self.name,
-            self.terms,
+            self.terms if self.system is None else None,
+            system=self.system,
             t0=self.t0,
             t1=self.t1,
             args=args,

@@ -2,13 +2,12 @@
 
 from typing import Any, NamedTuple, TypeAlias
 
-import diffrax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._constraint import Constraint
 from .._custom_types import FloatScalar, RealScalarLike
+from .._mechanics import MechanicalSystem
 from ._problem import Problem, require_standard
 
 
@@ -46,72 +45,33 @@ END = (
 )
 
 
-class _Road(NamedTuple):
-    """The right wheel `(x, y)` and its first and second time derivatives."""
-
-    x: FloatScalar
-    y: FloatScalar
-    dx: FloatScalar
-    dy: FloatScalar
-    ddx: FloatScalar
-    ddy: FloatScalar
+def _mass(q: Float[Array, "4"], args: CarAxisArgs) -> FloatScalar:
+    del q
+    return args.mass * args.epsilon**2 / 2
 
 
-def _road(t: RealScalarLike, args: CarAxisArgs) -> _Road:
-    r, w = args.road_amplitude, args.road_frequency
-    y, dy = r * jnp.sin(w * t), r * w * jnp.cos(w * t)
-    ddy = -(w**2) * y
-    x = jnp.sqrt(args.length**2 - y**2)
-    dx = -y * dy / x
-    ddx = -(dy**2 + y * ddy + dx**2) / x
-    return _Road(x, y, dx, dy, ddx, ddy)
+def _wheel(t: RealScalarLike, args: CarAxisArgs) -> tuple[FloatScalar, FloatScalar]:
+    """The right wheel, on the road."""
+    y = args.road_amplitude * jnp.sin(args.road_frequency * t)
+    return jnp.sqrt(args.length**2 - y**2), y
 
 
-def _field(t: RealScalarLike, y: State, args: CarAxisArgs) -> State:
-    q, v = y
-    road = _road(t, args)
-    xl, yl, xr, yr = q[0], q[1], q[2], q[3]
-    vxl, vyl, vxr, vyr = v[0], v[1], v[2], v[3]
-    # accelerations by springs and gravity alone; the mass matrix is k times the identity
-    k = args.mass * args.epsilon**2 / 2
-    left = (args.spring_length / jnp.sqrt(xl**2 + yl**2) - 1) / k
-    right = (args.spring_length / jnp.sqrt((xr - road.x) ** 2 + (yr - road.y) ** 2) - 1) / k
-    axl, ayl = left * xl, left * yl - args.gravity
-    axr, ayr = right * (xr - road.x), right * (yr - road.y) - args.gravity
-    # rows of J = d phi / d q: (xb, yb, 0, 0) and 2 (dx, dy, -dx, -dy);
-    # right-hand side J a_free + gamma, where J a + gamma = phi''
-    dx, dy = xl - xr, yl - yr
-    rhs1 = road.x * axl + road.y * ayl + road.ddx * xl + road.ddy * yl
-    rhs1 = rhs1 + 2 * (road.dx * vxl + road.dy * vyl)
-    rhs2 = 2 * (dx * (axl - axr) + dy * (ayl - ayr) + (vxl - vxr) ** 2 + (vyl - vyr) ** 2)
-    # Schur complement J J^T (2 x 2) by Cramer's rule: mu = lambda / k
-    s11 = road.x**2 + road.y**2
-    s12 = 2 * (road.x * dx + road.y * dy)
-    s22 = 8 * (dx**2 + dy**2)
-    determinant = s11 * s22 - s12**2
-    mu1 = (s22 * rhs1 - s12 * rhs2) / determinant
-    mu2 = 2 * (s11 * rhs2 - s12 * rhs1) / determinant
-    acceleration = [
-        axl - mu1 * road.x - mu2 * dx,
-        ayl - mu1 * road.y - mu2 * dy,
-        axr + mu2 * dx,
-        ayr + mu2 * dy,
-    ]
-    return v, jnp.stack(acceleration)
+def _linkage(t: RealScalarLike, q: Float[Array, "4"], args: CarAxisArgs) -> Float[Array, "2"]:
+    wheel_x, wheel_y = _wheel(t, args)
+    dx, dy = q[0] - q[2], q[1] - q[3]
+    return jnp.stack([wheel_x * q[0] + wheel_y * q[1], dx**2 + dy**2 - args.length**2])
 
 
-def _residual(
-    t: RealScalarLike, y: State, args: CarAxisArgs
-) -> tuple[Float[Array, "2"], Float[Array, "2"]]:
-    q, v = y
-    road = _road(t, args)
-    xl, yl, dx, dy = q[0], q[1], q[0] - q[2], q[1] - q[3]
-    position = [road.x * xl + road.y * yl, dx**2 + dy**2 - args.length**2]
-    velocity = [
-        road.x * v[0] + road.y * v[1] + road.dx * xl + road.dy * yl,
-        2 * (dx * (v[0] - v[2]) + dy * (v[1] - v[3])),
-    ]
-    return jnp.stack(position), jnp.stack(velocity)
+def _force(
+    t: RealScalarLike, q: Float[Array, "4"], v: Float[Array, "4"], args: CarAxisArgs
+) -> Float[Array, "4"]:
+    del v
+    wheel_x, wheel_y = _wheel(t, args)
+    xl, yl, xr, yr = q[0], q[1], q[2] - wheel_x, q[3] - wheel_y
+    left = args.spring_length / jnp.sqrt(xl**2 + yl**2) - 1
+    right = args.spring_length / jnp.sqrt(xr**2 + yr**2) - 1
+    weight = _mass(q, args) * args.gravity
+    return jnp.stack([left * xl, left * yl - weight, right * xr, right * yr - weight])
 
 
 def _initial_state(args: CarAxisArgs, start: State | None) -> State:
@@ -123,11 +83,6 @@ def _initial_state(args: CarAxisArgs, start: State | None) -> State:
     # xb xl' + yb' yl = 0. For the standard parameters the speed is -1/2.
     speed = -args.road_amplitude * args.road_frequency * height / L
     return jnp.stack([zero, height, L, height]), jnp.stack([speed, zero, speed, zero])
-
-
-def _make_constraint(args: CarAxisArgs, y0: State) -> Constraint:
-    del args, y0
-    return Constraint(_residual)
 
 
 def _exact(t: np.ndarray, args: CarAxisArgs, y0: Any) -> tuple[np.ndarray, np.ndarray]:
@@ -179,7 +134,7 @@ def car_axis(
     """
     return Problem(
         "car-axis",
-        diffrax.ODETerm(_field),
+        system=MechanicalSystem(_mass, _linkage, _force),
         t1=3.0,
         args=CarAxisArgs(
             mass,
@@ -191,7 +146,6 @@ def car_axis(
             gravity,
         ),
         initial_state=_initial_state,
-        make_constraint=_make_constraint,
         exact=_exact,
         at_end_only=True,
     )

@@ -2,15 +2,14 @@
 
 from typing import Any, NamedTuple, TypeAlias
 
-import diffrax
 import jax.numpy as jnp
 import numpy as np
 import scipy.special
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
-from .._constraint import Constraint
 from .._custom_types import FloatScalar, RealScalarLike
+from .._mechanics import MechanicalSystem
 from ._problem import as_floating, Problem
 
 
@@ -39,21 +38,21 @@ class PendulumArgs(NamedTuple):
     mass: Any = 1.0
 
 
-def _field(t: RealScalarLike, y: State, args: PendulumArgs) -> State:
-    del t
-    q, v = y
-    force = jnp.stack([jnp.zeros_like(args.mass), -args.mass * args.gravity])
-    free = force / args.mass
-    # a = force / m - mu q, with mu such that the constraint holds for the accelerations:
-    # q.a + v.v = 0.
-    mu = (jnp.sum(q * free) + jnp.sum(v * v)) / jnp.sum(q * q)
-    return v, free - mu * q
+def _mass(q: Float[Array, "2"], args: PendulumArgs) -> FloatScalar:
+    del q
+    return args.mass
 
 
-def _residual(t: RealScalarLike, y: State, args: PendulumArgs) -> tuple[FloatScalar, FloatScalar]:
+def _rod(t: RealScalarLike, q: Float[Array, "2"], args: PendulumArgs) -> FloatScalar:
     del t
-    q, v = y
-    return jnp.sum(q * q) - args.length**2, jnp.sum(q * v)
+    return jnp.sum(q * q) - args.length**2
+
+
+def _force(
+    t: RealScalarLike, q: Float[Array, "2"], v: Float[Array, "2"], args: PendulumArgs
+) -> Float[Array, "2"]:
+    del t, q, v
+    return jnp.stack([jnp.zeros_like(args.mass), -args.mass * args.gravity])
 
 
 def _initial_state(args: PendulumArgs, start: State) -> State:
@@ -61,18 +60,23 @@ def _initial_state(args: PendulumArgs, start: State) -> State:
     return q * (args.length / jnp.sqrt(jnp.sum(q * q))), v
 
 
-def _make_constraint(args: PendulumArgs, y0: State) -> Constraint:
-    del args, y0
-    return Constraint(_residual)
-
-
 def _exact(t: np.ndarray, args: PendulumArgs, y0: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Jacobi elliptic functions; `theta` is measured from the downward vertical."""
     (x, y), (vx, vy) = y0
     L = float(args.length)
-    frequency = np.sqrt(float(args.gravity) / L)
     theta = np.arctan2(x, -y)
     rate = (vx * np.cos(theta) + vy * np.sin(theta)) / L
+    sin_half, cos_half, rate = swing(t, np.sqrt(float(args.gravity) / L), theta, rate)
+    sin, cos = 2 * sin_half * cos_half, 1 - 2 * sin_half**2
+    q = L * np.stack([sin, -cos], axis=-1)
+    v = L * np.stack([rate * cos, rate * sin], axis=-1)
+    return q, v
+
+
+def swing(
+    t: np.ndarray, frequency: float, theta: float, rate: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """`theta'' = -frequency^2 sin(theta)` by Jacobi elliptic functions, `theta` and `rate` at
+    time 0: `sin(theta / 2)`, `cos(theta / 2)` and `theta'` at `t`."""
     # k^2 = (energy above the lowest point) / (2 m g L), at least 1 if it goes over the top
     k2 = (rate / (2 * frequency)) ** 2 + np.sin(theta / 2) ** 2
     k = np.sqrt(k2)
@@ -82,19 +86,15 @@ def _exact(t: np.ndarray, args: PendulumArgs, y0: Any) -> tuple[np.ndarray, np.n
         phase = np.arctan2(2 * frequency * np.sin(theta / 2), rate)
         u = scipy.special.ellipkinc(phase, k2) + frequency * t
         sn, cn, dn, _ = scipy.special.ellipj(u, k2)
-        sin_half, cos_half, rate = k * sn, dn, 2 * frequency * k * cn
-    else:
-        # theta / 2 = +-am
-        sense = np.copysign(1.0, rate)
-        u = scipy.special.ellipkinc(sense * theta / 2, 1 / k2) + frequency * k * t
-        if not np.all(np.isfinite(u)):  # at rest in the upper equilibrium
-            return np.broadcast_to(y0[0], (t.size, 2)), np.zeros((t.size, 2))
-        sn, cn, dn, _ = scipy.special.ellipj(u, 1 / k2)
-        sin_half, cos_half, rate = sense * sn, cn, sense * 2 * frequency * k * dn
-    sin, cos = 2 * sin_half * cos_half, 1 - 2 * sin_half**2
-    q = L * np.stack([sin, -cos], axis=-1)
-    v = L * np.stack([rate * cos, rate * sin], axis=-1)
-    return q, v
+        return k * sn, dn, 2 * frequency * k * cn
+    # theta / 2 = +-am
+    sense = np.copysign(1.0, rate)
+    u = scipy.special.ellipkinc(sense * theta / 2, 1 / k2) + frequency * k * t
+    if not np.all(np.isfinite(u)):  # at rest in the upper equilibrium
+        still = np.ones(t.size)
+        return np.sin(theta / 2) * still, np.cos(theta / 2) * still, 0 * still
+    sn, cn, dn, _ = scipy.special.ellipj(u, 1 / k2)
+    return sense * sn, cn, sense * 2 * frequency * k * dn
 
 
 def pendulum(
@@ -111,8 +111,7 @@ def pendulum(
     $$m q'' = (0, -m g) - 2 \lambda q, \quad |q|^2 = L^2, \quad q \cdot q' = 0.$$
 
     The state is `(q, v)`, each of shape `(2,)`; two constraints, position and velocity.
-    The accelerations are written out, $q'' = (0, -g) - \mu q$ with
-    $\mu = (v \cdot v - g y) / |q|^2$; mass and length do not enter them.
+    The rod pushes with the force $-2 \lambda q$, $2 m^{-1} \lambda = (v \cdot v - g y) / L^2$.
 
     Exact solution by Jacobi elliptic functions from every initial state (swinging or going
     over the top), to about `1e-15 (1 + sqrt(g/L) t)` away from the separatrix.
@@ -147,12 +146,11 @@ def pendulum(
     _check_start(q0, v0, length)
     return Problem(
         "pendulum",
-        diffrax.ODETerm(_field),
+        system=MechanicalSystem(_mass, _rod, _force),
         t1=t1,
         args=PendulumArgs(gravity, length, mass),
         start=(q0, v0),
         initial_state=_initial_state,
-        make_constraint=_make_constraint,
         exact=_exact,
     )
 
