@@ -73,7 +73,7 @@ def four_bar_model(problem: Problem, h: float) -> str:
     args, q = problem.args, np.asarray(problem.y0[0])
     masses, lengths = np.asarray(args.masses), np.asarray(args.lengths)
     # The rocker of the gallery points from its pivot to the coupler, here it is the other way.
-    angles = np.diff(q[2::3] + [0, 0, np.pi], prepend=0.0)
+    angles = np.diff(q[2::3] + np.array([0, 0, np.pi]), prepend=0.0)
     bodies, closing = "", ""
     for i, name in enumerate(("crank", "coupler", "rocker")):
         offset = 0.0 if i == 0 else lengths[i - 1]

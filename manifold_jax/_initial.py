@@ -150,7 +150,8 @@ def initial_step(
     def norm(v: Y) -> FloatScalar:
         return jnp.asarray(controller.norm(jtu.tree_map(lambda a, s: a / s, v, scale)), t0.dtype)
 
-    vector_field = lambda t, y: terms.vf_prod(t, y, args, 1.0)
+    unit = jnp.ones((), t0.dtype)
+    vector_field = lambda t, y: terms.vf_prod(t, y, args, unit)
     f0 = vector_field(t0, y0)
     d0, d1 = norm(y0), norm(f0)
     small = (d0 < 1e-5) | (d1 < 1e-5)

@@ -58,15 +58,19 @@ class PseudoInverse(eqx.Module):
         return self.inverse @ b
 
 
-def factorize(A: Float[Array, "m m"], redundant: bool = False) -> Factorization | PseudoInverse:
+def factorize(
+    A: Float[Array, "m m"], redundant: bool = False, threshold: float | None = None
+) -> Factorization | PseudoInverse:
     """Factor `A`, symmetric positive semidefinite if `redundant`.
 
-    The rank counts as full when every pivot exceeds `10 m eps` times its diagonal entry:
+    The rank counts as full when every pivot exceeds `threshold` times its diagonal entry, by
+    default `10 m eps`:
     for a Gram matrix `A = G W^-1 G^T` that ratio is the squared sine of the angle between
     one row of `G` and the span of those before it, and rounding leaves about `eps` of it.
     """
     m = A.shape[0]
-    threshold = 10 * m * jnp.finfo(A.dtype).eps
+    if threshold is None:
+        threshold = 10 * m * float(jnp.finfo(A.dtype).eps)
     if redundant:
         finite = jnp.all(jnp.isfinite(A))
         A = jnp.where(finite, A, jnp.eye(m, dtype=A.dtype))

@@ -7,6 +7,7 @@ the leading error term raise the order there.
 import diffrax as dfx
 import jax
 import jax.flatten_util as jfu
+import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 import pytest
@@ -43,28 +44,26 @@ def pendulum():
     return problem, problem.constraint, 3.0
 
 
-def double_pendulum():
-    problem = mj.problems.double_pendulum()
-    return problem, problem.constraint, 1.5
-
-
-def fitted_order(solver, counts, problem, constraint, end, hook=mj.Projected):
+def fitted_order(solver, counts, problem, constraint, end):
     """Least-squares slope of log(error) against log(step), errors in 1e-11 .. 1e-2."""
-    hooked = hook(solver, constraint)
+    projected = mj.Projected(solver, constraint)
 
     @jax.jit
     def solve(dt0):
         sol = mj.diffeqsolve(
-            problem.terms, hooked, 0.0, end, dt0, problem.y0, problem.args, max_steps=140000
+            problem.terms, projected, 0.0, end, dt0, problem.y0, problem.args, max_steps=140000
         )
         return jfu.ravel_pytree(sol.ys)[0]
 
     exact = np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(problem.reference(end))])
     errors = np.array([np.abs(np.asarray(solve(end / count)) - exact).max() for count in counts])
+    return slope_of(counts, errors), errors
+
+
+def slope_of(counts, errors):
     fit = (errors > 1e-11) & (errors < 1e-2)
     assert fit.sum() >= 3, errors
-    slope, _ = np.polyfit(np.log(1 / np.array(counts)[fit]), np.log(errors[fit]), 1)
-    return slope, errors
+    return np.polyfit(np.log(1 / np.array(counts)[fit]), np.log(errors[fit]), 1)[0]
 
 
 @pytest.mark.parametrize("make", [sphere_only, pendulum])
@@ -96,27 +95,104 @@ HOOKS = {
         solver, constraint, stabilization=mj.ExactStabilization(2.0)
     ),
 }
-PROBLEMS = [sphere_only, pendulum, double_pendulum]
+
+
+def tumbling():
+    """The rigid body again, |y|^2 = 1 alone, from a less special start."""
+    problem = mj.problems.rigid_body()
+    start = np.array([0.5, 0.1, 0.9])
+    problem = problem.with_initial(jnp.asarray(start / np.linalg.norm(start)))
+    return problem, mj.Constraint(lambda t, y, args: y @ y - 1.0), 30.0
+
+
+def tumbling_longer():
+    problem, constraint, end = tumbling()
+    return problem, constraint, 4 * end
+
+
+def swinging():
+    """Within 37 degrees, where a coordinate partition need not change."""
+    problem = mj.problems.pendulum(q0=(0.6, -0.8))
+    return problem, problem.constraint, 6.0
+
+
+def two_rods():
+    """Of different masses and lengths."""
+    problem = mj.problems.double_pendulum(angles=(0.5, 0.9), masses=(1.0, 0.5), lengths=(1.0, 0.8))
+    return problem, problem.constraint, 4.0
+
+
+# Step counts where the leading term of the error dominates.
+COUNTS = {
+    ("Bosh3", tumbling): [512, 768, 1024, 1536, 2000],
+    ("Bosh3", swinging): [256, 384, 512, 1024, 1536],
+    ("Bosh3", two_rods): [256, 384, 512, 1024, 1536],
+    ("Dopri5", tumbling): [512, 768, 1024, 1536],
+    ("Dopri5", tumbling_longer): [1000, 1200, 1400, 1600, 2000],
+    ("Dopri5", swinging): [384, 512, 640, 768, 1024],
+    ("Dopri5", two_rods): [128, 192, 256, 384],
+    ("Dopri8", tumbling): [24, 28, 32, 40, 48, 56, 64],
+    ("Dopri8", swinging): [24, 32, 40, 48, 56, 64, 80],
+    ("Dopri8", two_rods): [32, 40, 48, 56, 64],
+}
+# Charts converge faster than they have to there: measured 9.65 (tangent), 9.34 (partition).
+FASTER = {("Dopri8", tumbling, "tangent"), ("Dopri8", tumbling, "partition")}
 # One solver for every approach by default, the rest in the slow part.
-QUICK = {("Dopri5", make, hook) for make in (double_pendulum,) for hook in HOOKS}
 CASES = [
     pytest.param(
         name,
         make,
         hook,
-        marks=() if (name, make, hook) in QUICK else pytest.mark.slow,
+        marks=() if (name, make) == ("Dopri5", two_rods) else pytest.mark.slow,
         id=f"{name}-{make.__name__}-{hook}",
     )
-    for name in ("Bosh3", "Dopri5", "Dopri8")
-    for make in PROBLEMS
+    for name, make in COUNTS
     for hook in HOOKS
-    if hook != "projected" or make is double_pendulum  # the others are above
+    # The stabilized errors are larger and need smaller steps, the others a longer time.
+    if name != "Dopri5"
+    or make is two_rods
+    or make is swinging
+    or (hook == "invariant") == (make is tumbling)
 ]
+
+
+def largest_errors(solver, counts, problem, constraint, end, hook):
+    """Over all steps, as the error of a method of high order changes sign along the way."""
+    hooked = hook(solver, constraint)
+
+    @jax.jit
+    def solve(dt0):
+        sol = mj.diffeqsolve(
+            problem.terms,
+            hooked,
+            0.0,
+            end,
+            dt0,
+            problem.y0,
+            problem.args,
+            saveat=dfx.SaveAt(steps=True),
+            max_steps=2048,
+        )
+        return sol.ts, jax.vmap(lambda y: jfu.ravel_pytree(y)[0])(sol.ys)
+
+    errors = []
+    for count in counts:
+        t, y = map(np.asarray, solve(end / count))
+        used = np.isfinite(t)
+        exact = jax.tree.leaves(problem.reference(t[used]))
+        exact = np.concatenate([np.reshape(leaf, (used.sum(), -1)) for leaf in exact], axis=1)
+        errors.append(np.abs(y[used] - exact).max())
+    return np.array(errors)
 
 
 @pytest.mark.parametrize(("name", "make", "hook"), CASES)
 def test_order_of_every_approach(name, make, hook):
-    solver, order, counts = METHODS[name]
-    slope, errors = fitted_order(solver, counts, *make(), HOOKS[hook])
-    print(f"{name:9s} {make.__name__:15s} {hook:10s} slope {slope:.3f}  errors {errors}")
-    check(name, slope, order)
+    solver, order, _ = METHODS[name]
+    counts = COUNTS[name, make]
+    errors = largest_errors(solver, counts, *make(), HOOKS[hook])
+    slope = slope_of(counts, errors)
+    print(f"{name:9s} {make.__name__:10s} {hook:10s} slope {slope:.3f}  errors {errors}")
+    if (name, make, hook) in FASTER:
+        assert 7.5 <= slope <= 10
+    else:
+        check(name, slope, order)

@@ -154,7 +154,7 @@ def violation(problem, t, y):
     return np.max(np.abs(flatten(residual(problem, jnp.asarray(t), y))))
 
 
-def integrate(problem, tolerance=1e-13):
+def integrate(problem, tolerance=3e-14):
     """End state by SciPy, an independent integrator, on the same vector field."""
     y0, unravel = jfu.ravel_pytree(problem.y0)
     field = jax.jit(lambda t, x: jfu.ravel_pytree(vector_field(problem, t, unravel(x)))[0])
@@ -210,7 +210,13 @@ def test_reference_solves_the_equation(build):
         np.testing.assert_allclose(slope, rate, rtol=1e-8, atol=1e-8)
 
 
-@named(EVERY)
+def is_redundant(problem):
+    """Off the manifold redundant equations contradict each other: rounding errors grow by 1e10
+    on the parallelogram, unless they are projected away."""
+    return problem.system is not None and problem.system.redundant
+
+
+@named((name, build) for name, build in EVERY if not is_redundant(build()))
 def test_scipy_meets_the_reference(build):
     problem = build()
     end = flatten(problem.reference(problem.t1))

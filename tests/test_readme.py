@@ -3,19 +3,33 @@
 import re
 from pathlib import Path
 
+import diffrax
 import jax
 import numpy as np
 import pytest
+
+import manifold_jax
 
 
 README = Path(__file__).parents[1] / "README.md"
 
 
+def blocks():
+    return re.findall(r"```python\n(.*?)```", README.read_text(), flags=re.DOTALL)
+
+
 @pytest.fixture
 def example():
-    blocks = re.findall(r"```python\n(.*?)```", README.read_text(), flags=re.DOTALL)
-    assert blocks
-    return blocks[0]
+    return blocks()[0]
+
+
+def test_mechanism_example_runs():
+    with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
+        namespace = {"jax": jax, "jnp": jax.numpy, "dfx": diffrax, "mj": manifold_jax}
+        exec(compile(blocks()[1], str(README), "exec"), namespace)
+    q = np.asarray(namespace["sol"].ys[0][-1])
+    np.testing.assert_allclose(np.linalg.norm([q[0], q[1] - q[0]], axis=1), 1, atol=1e-15)
+    assert namespace["forces"].shape == (2,)
 
 
 def test_example_runs_and_keeps_the_manifold(example):

@@ -95,7 +95,8 @@ def factorize_mass(M: Float[Array, "..."], C: Float[Array, "m n"]) -> Mass:
         return Mass(jnp.where(positive, M, 1), None, None, yes, positive)
     asymmetry = jnp.max(jnp.abs(M - M.T))
     symmetric = asymmetry <= 100 * jnp.finfo(M.dtype).eps * jnp.max(jnp.abs(M))
-    plain = _factorize_positive(M)
+    # Generous, as nothing is lost by adding to a matrix that is only nearly singular.
+    plain = _factorize_positive(M, float(jnp.finfo(M.dtype).eps) ** 0.5)
     size = jnp.maximum(jnp.sum(C * C, axis=1), jnp.finfo(M.dtype).tiny)
     weights = jax.lax.stop_gradient(jnp.trace(M) / M.shape[0] / size)
     augmented = lambda: _factorize_positive(M + gram((C * weights[:, None]).T, C.T))
@@ -104,12 +105,13 @@ def factorize_mass(M: Float[Array, "..."], C: Float[Array, "m n"]) -> Mass:
     return Mass(None, factorization, augmentation, symmetric, factorization.full_rank)
 
 
-def _factorize_positive(M: Float[Array, "n n"]) -> Factorization:
+def _factorize_positive(M: Float[Array, "n n"], threshold: float | None = None) -> Factorization:
+    if threshold is None:
+        threshold = 10 * M.shape[0] * float(jnp.finfo(M.dtype).eps)
     if M.shape[0] <= UNROLL_LIMIT:
-        return factorize(M)  # which wants positive pivots
+        return factorize(M, threshold=threshold)  # which wants positive pivots
     size = jnp.sqrt(jnp.maximum(jnp.abs(jnp.diagonal(M)), jnp.finfo(M.dtype).tiny))
     lower = jnp.linalg.cholesky(jax.lax.stop_gradient(M / size[:, None] / size[None, :]))
-    threshold = 10 * M.shape[0] * jnp.finfo(M.dtype).eps
     positive = jnp.all(jnp.diagonal(lower) ** 2 > threshold)  # NaN unless positive definite
     factorization = factorize(jnp.where(positive, M, jnp.eye(M.shape[0], dtype=M.dtype)))
     return Factorization(factorization.lu, positive)

@@ -33,7 +33,7 @@ BENCHMARK = dict(
     t1=2.0,
 )
 # Displacement of the centre of mass (m) and quaternion at its end, t = 2 s. By a method of
-# second order with steps of 2e-6 s: 6 digits are right. Source: Kynema,
+# second order with steps of 2e-6 s: 5 digits are right. Source: Kynema,
 # tests/regression_tests/regression/verification/dynamic_heavy_top.cpp.
 BENCHMARK_DISPLACEMENT = (-0.150416985652933, -1.724164450779749, -0.673023460701136)
 BENCHMARK_QUATERNION = (
@@ -157,7 +157,7 @@ def heavy_top(
     function that it is.
 
     The benchmark of the literature is `heavy_top(**BENCHMARK)`, a top that spins at 150 rad/s,
-    with 6 published digits at the end
+    with 5 published digits at the end
     (`from manifold_jax.problems.heavy_top import BENCHMARK, BENCHMARK_QUATERNION`).
 
     **Arguments:**
