@@ -2,7 +2,8 @@
 
 `python -m benchmarks.overhead --json benchmarks/results/overhead.json`
 
-The planar pendulum in Cartesian coordinates, Tsit5, rtol = atol = 1e-6, ten seconds.
+The planar pendulum in Cartesian coordinates, Tsit5, rtol = atol = 1e-6, ten seconds; and a batch of
+double pendulums (`_mechanics_overhead`).
 """
 
 import dataclasses
@@ -36,6 +37,7 @@ from ._measure import (
     use_double_precision,
     write_json,
 )
+from ._mechanics_overhead import BATCH, time_accelerations, time_solves
 
 
 TOLERANCE = 1e-6
@@ -46,6 +48,9 @@ ANGLES = (0.3, 1.5)  # of the batch: starts at rest, measured from the downward 
 RUN_GOAL = 1.3
 COMPILE_STEPS_GOAL = 2.0
 COMPILE_SAVED_GOAL = 2.5
+MECHANICS_GOAL = 1.2
+LOCAL_GOAL = 4.0
+ACCELERATIONS_GOAL = 0.25
 
 
 class Variant(NamedTuple):
@@ -293,6 +298,21 @@ def run_ratios(
     return ratios
 
 
+def mechanics_ratios(accelerations: dict[str, Timing], solves: dict[str, Timing]) -> list[Ratio]:
+    ours, dense = (timing.median_ms for timing in accelerations.values())
+    ms = {name: timing.median_ms for name, timing in solves.items()}
+    name = f"batch of {BATCH} double pendulums"
+    return [
+        Ratio("accelerations: ours / dense solve", ours / dense, ACCELERATIONS_GOAL),
+        Ratio(f"{name}: projected / plain", ms["projected"] / ms["plain"], MECHANICS_GOAL),
+        Ratio(
+            f"{name}: local coordinates / projected",
+            ms["local coordinates"] / ms["projected"],
+            LOCAL_GOAL,
+        ),
+    ]
+
+
 def compile_ratios(times: dict[str, CompileTime]) -> list[Ratio]:
     """Goals are for the time by the clock."""
     cases = (
@@ -391,9 +411,16 @@ def main(
         many = batch_of_trajectories(problem, batch, repeats)
         points = many_saved_points(problem, repeats)
         gradient = gradients(problem, repeats)
+        double = mj.problems.double_pendulum()
+        accelerations = time_accelerations(double, repeats)
+        solves = time_solves(double, max(1, repeats // 5))
         seconds = compile_times(problem, compile_repeats)
     rows = [*single, *many, *points, *gradient]
-    ratios = run_ratios(single, many, points, gradient) + compile_ratios(seconds)
+    ratios = [
+        *run_ratios(single, many, points, gradient),
+        *mechanics_ratios(accelerations, solves),
+        *compile_ratios(seconds),
+    ]
     for table in (run_table(rows), compile_table(seconds), ratio_table(ratios)):
         console.print(table)
     if json is not None:
@@ -401,6 +428,10 @@ def main(
             "environment": environment(),
             "settings": settings(problem, batch, repeats, compile_repeats),
             "runs": [dataclasses.asdict(row) for row in rows],
+            "mechanics": {
+                name: dataclasses.asdict(timing)
+                for name, timing in {**accelerations, **solves}.items()
+            },
             "compilations": {name: dataclasses.asdict(s) for name, s in seconds.items()},
             "ratios": [{**dataclasses.asdict(ratio), "met": ratio.met} for ratio in ratios],
         }
