@@ -76,12 +76,18 @@ def compiled(function: Callable, *args: Any) -> tuple[Callable[[], Any], Compile
 
     The program takes no arguments and blocks until its result is there.
     """
+    program, seconds = compiled_for_any(function, *args)
+    return lambda: program(*args), seconds
+
+
+def compiled_for_any(function: Callable, *args: Any) -> tuple[Callable[..., Any], CompileTime]:
+    """The same, but a program that takes arguments of the shapes and types of `args`."""
     # Otherwise the second program profits from what was traced for the first.
     jax.clear_caches()
     wall, process = time.perf_counter(), time.process_time()
     program = jax.jit(function).lower(*args).compile()
     seconds = CompileTime(time.perf_counter() - wall, time.process_time() - process)
-    return lambda: jax.block_until_ready(program(*args)), seconds
+    return lambda *args: jax.block_until_ready(program(*args)), seconds
 
 
 def median_compile_times(

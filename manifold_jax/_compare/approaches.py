@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import diffrax as dfx
 import equinox as eqx
@@ -108,6 +108,6 @@ APPROACHES: tuple[Approach, ...] = (
 )
 
 
-def with_vector_field(terms: dfx.AbstractTerm, wrap: Callable[[Callable], Callable]):
+def with_vector_field(terms: Any, wrap: Callable[[Callable], Callable]) -> Any:
     """The same terms with `wrap(f)` in place of their vector field `f(t, y, args)`."""
     return eqx.tree_at(lambda term: term.vector_field, terms, wrap(terms.vector_field))

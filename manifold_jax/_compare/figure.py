@@ -72,7 +72,7 @@ def _style(key: str) -> dict[str, Any]:
     return dict(color=colour, linestyle=line, linewidth=1.2, zorder=1 if "scipy" in key else 2)
 
 
-def _draw_path(axes: Axes, task: Task, solved: Sequence[_Solved], dimension: int) -> None:
+def _draw_path(axes: Axes, task: Task, solved: Sequence, dimension: int) -> None:
     """The first leaf as a curve in the plane or in space."""
     # Nested, the first the widest: usually the curves are the same to the eye.
     for i, (measurement, style) in enumerate(solved):
@@ -97,7 +97,7 @@ def _draw_path(axes: Axes, task: Task, solved: Sequence[_Solved], dimension: int
         axes.set_aspect("equal", adjustable="datalim")
 
 
-def _draw_components(axes: Axes, task: Task, solved: Sequence[_Solved], count: int) -> None:
+def _draw_components(axes: Axes, task: Task, solved: Sequence, count: int) -> None:
     """The first leaf over time, if it has too many components for a curve.
 
     Of one method only, as the lines of several could not be told apart; the other panels
@@ -112,7 +112,7 @@ def _draw_components(axes: Axes, task: Task, solved: Sequence[_Solved], count: i
     axes.set(xlabel="$t$", title=f"components, {measurement.row.method}")
 
 
-def _draw_violations(axes: Axes, task: Task, solved: Sequence[_Solved]) -> list:
+def _draw_violations(axes: Axes, task: Task, solved: Sequence) -> list:
     lines = []
     for m, style in solved:
         lines += axes.semilogy(*_largest_in_intervals(task.grid, m.violations), **style)
@@ -121,7 +121,7 @@ def _draw_violations(axes: Axes, task: Task, solved: Sequence[_Solved]) -> list:
     return lines
 
 
-def _draw_errors(axes: Axes, task: Task, solved: Sequence[_Solved]) -> None:
+def _draw_errors(axes: Axes, task: Task, solved: Sequence) -> None:
     axes.grid(alpha=0.3)
     axes.set(xlabel="$t$", title="error of the state, max norm")
     if task.reference() is None:
