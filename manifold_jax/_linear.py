@@ -72,9 +72,7 @@ def factorize(
     if threshold is None:
         threshold = 10 * m * float(jnp.finfo(A.dtype).eps)
     if redundant:
-        finite = jnp.all(jnp.isfinite(A))
-        A = jnp.where(finite, A, jnp.eye(m, dtype=A.dtype))
-        return PseudoInverse(jnp.linalg.pinv(A, rtol=threshold, hermitian=True), finite)
+        return _pseudo_invert(A)
     if m > UNROLL_LIMIT:
         return _factorize_with_library(A, threshold)
     lu = [[A[i, j] for j in range(m)] for i in range(m)]
@@ -88,6 +86,21 @@ def factorize(
             for j in range(k + 1, m):
                 lu[i][j] = lu[i][j] - lu[i][k] * lu[k][j]
     return Factorization(lu, full_rank)
+
+
+# Equations that depend on each other on the manifold do so only nearly at a stage beside it:
+# smaller eigenvalues of `A`, its rows scaled to a unit diagonal, count as zero.
+_DEPENDENT = 1e-3
+
+
+def _pseudo_invert(A: Float[Array, "m m"]) -> PseudoInverse:
+    finite = jnp.all(jnp.isfinite(A))
+    A = jnp.where(finite, A, jnp.eye(A.shape[0], dtype=A.dtype))
+    size = jnp.sqrt(jnp.maximum(jnp.diagonal(A), jnp.finfo(A.dtype).tiny))
+    scale = jax.lax.stop_gradient(1 / size[:, None] / size[None, :])
+    return PseudoInverse(
+        scale * jnp.linalg.pinv(scale * A, rtol=_DEPENDENT, hermitian=True), finite
+    )
 
 
 def _factorize_with_library(A: Float[Array, "m m"], threshold: float) -> Factorization:

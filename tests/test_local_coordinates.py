@@ -131,8 +131,15 @@ def test_every_stage_is_on_the_manifold(chart):
     assert run(mj.Projected(dfx.Tsit5(), constraint)).result != dfx.RESULTS.successful
 
 
-@pytest.mark.parametrize("chart", CHARTS)
-@pytest.mark.parametrize("solver", [dfx.Tsit5(), dfx.Kvaerno5()], ids=["tsit5", "kvaerno5"])
+@pytest.mark.parametrize(
+    ("solver", "chart"),
+    [
+        pytest.param(dfx.Tsit5(), "tangent", id="tsit5-tangent"),
+        pytest.param(dfx.Tsit5(), "partition", id="tsit5-partition", marks=pytest.mark.slow),
+        pytest.param(dfx.Kvaerno5(), "tangent", id="kvaerno5-tangent", marks=pytest.mark.slow),
+        pytest.param(dfx.Kvaerno5(), "partition", id="kvaerno5-partition", marks=pytest.mark.slow),
+    ],
+)
 def test_time_dependent_pytree_problem(solver, chart):
     """Forward and backward, dense output, with an explicit and an implicit solver."""
     hook = mj.LocalCoordinates(solver, outside.constraint(), chart=CHARTS[chart])
@@ -182,7 +189,7 @@ def swinging(gravity, chart, adjoint):
     return sol.ys[0][0, 0] + 0.3 * sol.ys[1][0, 1]
 
 
-@pytest.mark.parametrize("chart", CHARTS)
+@pytest.mark.parametrize("chart", ["tangent", pytest.param("partition", marks=pytest.mark.slow)])
 def test_gradients(chart):
     """Reverse = forward = central differences, at constant steps."""
     run = jax.jit(lambda g: swinging(g, chart, dfx.RecursiveCheckpointAdjoint()))

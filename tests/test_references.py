@@ -78,7 +78,9 @@ def test_slider_crank():
         np.testing.assert_allclose(leaf[0], SLIDER_CRANK[name], rtol=0, atol=1e-9)
 
 
-@pytest.mark.parametrize("links", [2, pytest.param(3, marks=pytest.mark.slow), 5])
+@pytest.mark.parametrize(
+    "links", [2, *(pytest.param(links, marks=pytest.mark.slow) for links in (3, 5))]
+)
 def test_chain(links):
     problem = mj.problems.chain(links)
     assert largest_error(problem, solve(problem, 1e-12)) <= 1e-9

@@ -68,7 +68,7 @@ class Problem(eqx.Module):
         """**Arguments:**
 
         - `name`, `terms`, `system`, `t0`, `t1`, `args`, `start`: as above. A `system`
-            provides its own `terms` and constraint.
+            provides its constraint and, unless they are given, too, its `terms`.
         - `y0`: the initial state, by default `initial_state(args, start)`.
         - `initial_state`: `(args, start) -> y0`, where `start` is `None` for the
             standard start.
@@ -80,10 +80,10 @@ class Problem(eqx.Module):
         The callables must be functions of a module: they are compared when compiled
         code is looked up.
         """
-        assert (system is None) == (terms is not None and make_constraint is not None)
+        assert (system is None) == (make_constraint is not None)
         self.name = name
         self.system = system
-        self.terms = terms if system is None else system.terms
+        self.terms = system.terms if terms is None else terms
         self.t0 = t0
         self.t1 = t1
         self.args = jtu.tree_map(as_floating, args)
@@ -159,7 +159,7 @@ class Problem(eqx.Module):
     def _rebuild(self, *, args: Args, start: Y | None, y0: Y | None) -> "Problem":
         return Problem(
             self.name,
-            self.terms if self.system is None else None,
+            self.terms,
             system=self.system,
             t0=self.t0,
             t1=self.t1,

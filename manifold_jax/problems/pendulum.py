@@ -2,6 +2,7 @@
 
 from typing import Any, NamedTuple, TypeAlias
 
+import diffrax
 import jax.numpy as jnp
 import numpy as np
 import scipy.special
@@ -53,6 +54,16 @@ def _force(
 ) -> Float[Array, "2"]:
     del t, q, v
     return jnp.stack([jnp.zeros_like(args.mass), -args.mass * args.gravity])
+
+
+def _field(t: RealScalarLike, y: State, args: PendulumArgs) -> State:
+    """The field of the system, written out; mass cancels."""
+    del t
+    q, v = y
+    free = jnp.stack([jnp.zeros_like(args.gravity), -args.gravity])
+    # q . a + v . v = 0, the second derivative of the constraint
+    mu = (jnp.sum(q * free) + jnp.sum(v * v)) / jnp.sum(q * q)
+    return v, free - mu * q
 
 
 def _initial_state(args: PendulumArgs, start: State) -> State:
@@ -146,6 +157,7 @@ def pendulum(
     _check_start(q0, v0, length)
     return Problem(
         "pendulum",
+        diffrax.ODETerm(_field),
         system=MechanicalSystem(_mass, _rod, _force),
         t1=t1,
         args=PendulumArgs(gravity, length, mass),
