@@ -89,18 +89,14 @@ def factorize(
 
 
 # Equations that depend on each other on the manifold do so only nearly at a stage beside it:
-# smaller eigenvalues of `A`, its rows scaled to a unit diagonal, count as zero.
-_DEPENDENT = 1e-3
+# eigenvalues of `A` below this fraction of the largest count as zero.
+_DEPENDENT = 1e-4
 
 
 def _pseudo_invert(A: Float[Array, "m m"]) -> PseudoInverse:
     finite = jnp.all(jnp.isfinite(A))
     A = jnp.where(finite, A, jnp.eye(A.shape[0], dtype=A.dtype))
-    size = jnp.sqrt(jnp.maximum(jnp.diagonal(A), jnp.finfo(A.dtype).tiny))
-    scale = jax.lax.stop_gradient(1 / size[:, None] / size[None, :])
-    return PseudoInverse(
-        scale * jnp.linalg.pinv(scale * A, rtol=_DEPENDENT, hermitian=True), finite
-    )
+    return PseudoInverse(jnp.linalg.pinv(A, rtol=_DEPENDENT, hermitian=True), finite)
 
 
 def _factorize_with_library(A: Float[Array, "m m"], threshold: float) -> Factorization:
