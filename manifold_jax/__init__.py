@@ -3,6 +3,7 @@
 from importlib.metadata import version
 
 from . import problems as problems
+from ._adjoint import StepReplayAdjoint as StepReplayAdjoint
 from ._chart import (
     CoordinatePartitionChart as CoordinatePartitionChart,
     TangentSpaceChart as TangentSpaceChart,

@@ -3,15 +3,32 @@
 Seen in Diffrax 0.7.2 and Equinox 0.13.8; each name has a test that fails when it moves.
 """
 
+from typing import Any
+
 import jax.tree_util as jtu
 from diffrax import RESULTS
-from diffrax._heuristics import is_sde as is_sde  # which terms are driven by Brownian motion
+from diffrax._heuristics import (
+    is_sde as is_sde,  # which terms are driven by Brownian motion
+    is_unsafe_sde as is_unsafe_sde,  # by one that cannot be evaluated twice
+)
+from diffrax._integrate import (
+    loop as diffrax_loop,  # what an adjoint has to run  # noqa: F401
+    SaveState,
+)
 from diffrax._saveat import save_y as save_y  # marks "save the state itself" in SubSaveAt.fn
 from diffrax._solution import (
     is_okay as is_okay,  # successful or stopped by an event
     update_result as update_result,  # first failure wins
 )
 from diffrax._term import WrapTerm
+from equinox.internal import (
+    buffer_at_set as buffer_at_set,  # writes in place, also under vmap
+    MaybeBuffer as MaybeBuffer,  # an array, or one that a loop writes to in place
+    nondifferentiable as nondifferentiable,
+    nondifferentiable_backward as nondifferentiable_backward,
+    unvmap_max as unvmap_max,  # over all lanes of a batch
+    while_loop as while_loop,  # Diffrax's loops take its arguments
+)
 from jaxtyping import PyTree
 
 from ._custom_types import RealScalarLike
@@ -37,3 +54,10 @@ def nonlinear_failure() -> RESULTS:
     return when their equations cannot be solved.
     """
     return RESULTS.nonlinear_divergence
+
+
+def save_states(state: Any) -> list[SaveState]:
+    """What a solve has saved so far, one per `SubSaveAt`."""
+    is_save_state = lambda x: isinstance(x, SaveState)
+    leaves = jtu.tree_leaves(state.save_state, is_leaf=is_save_state)
+    return [leaf for leaf in leaves if is_save_state(leaf)]

@@ -172,6 +172,6 @@ def initial_step(
 
 def controller_tolerances(controller: Any) -> dfx.PIDController | None:
     """The controller that holds `rtol`, `atol` and `norm`, inside any wrappers around it."""
-    while not hasattr(controller, "rtol") and hasattr(controller, "controller"):
+    while hasattr(controller, "controller"):
         controller = controller.controller
-    return controller if hasattr(controller, "rtol") else None
+    return controller if isinstance(controller, dfx.PIDController) else None

@@ -24,6 +24,7 @@ LAYERS = [
     {"_chart", "_stabilization"},
     {"_interpolation", "_initial"},
     {"_solver"},
+    {"_adjoint"},
     {"_output"},
     {"_diffeqsolve"},
     {"problems"},

@@ -1,0 +1,1 @@
+from .step_replay import StepReplayAdjoint as StepReplayAdjoint

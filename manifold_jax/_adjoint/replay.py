@@ -1,0 +1,267 @@
+"""The way back: the recorded steps in reverse order, each computed and transposed."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.lax as lax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jaxtyping import Array, Bool, Float, Int
+
+from .._compat import unvmap_max
+from .._custom_types import Args, IntScalar, RealScalarLike, Y
+from .record import Record
+
+
+# Interpolated values whose steps are transposed side by side.
+_CHUNK = 64
+
+
+class Saving(eqx.Module):
+    """One `SubSaveAt`: which rows it has, and the functions that make them."""
+
+    offset: int = eqx.field(static=True)  # 1 if the first row is that of `t0`, else 0
+    num_times: int = eqx.field(static=True)
+    steps: int = eqx.field(static=True)
+    end: bool = eqx.field(static=True)
+    at_state: Callable  # (t, y)
+    in_step: Callable | None  # (t, start, end, y)
+
+
+class Replay(eqx.Module):
+    """A solve as functions of single steps. What they close over are their leaves."""
+
+    step: Callable  # (start, end, y) -> next state, what each of the savings keeps of it
+    savings: list[Saving]
+
+    @staticmethod
+    def build(terms: Any, solver: Any, args: Args, saveat: dfx.SaveAt, t: Array, y: Y) -> "Replay":
+        subs = jtu.tree_leaves(saveat.subs, is_leaf=lambda x: isinstance(x, dfx.SubSaveAt))
+
+        def attempt(start, end, y):
+            state = solver.init(terms, start, end, y, args)
+            y1, _, dense_info, _, _ = solver.step(terms, start, end, y, args, state, False)
+            return y1, dense_info
+
+        def step(start, end, y):
+            y1, _ = attempt(start, end, y)
+            return y1, [sub.fn(end, y1, args) if sub.steps else None for sub in subs]
+
+        def saving(sub: dfx.SubSaveAt) -> Saving:
+            def in_step(t, start, end, y):
+                _, dense_info = attempt(start, end, y)
+                interpolation = solver.interpolation_cls(t0=start, t1=end, **dense_info)
+                return sub.fn(t, interpolation.evaluate(t), args)
+
+            convert = eqx.filter_closure_convert
+            at_state = convert(lambda t, y: sub.fn(t, y, args), t, y)
+            between = None if sub.ts is None else convert(in_step, t, t, t, y)
+            num_times = 0 if sub.ts is None else len(sub.ts)
+            at_end = sub.t1 and sub.steps != 1  # with every step the last row is one of those
+            return Saving(int(sub.t0), num_times, sub.steps, at_end, at_state, between)
+
+        return Replay(eqx.filter_closure_convert(step, t, t, y), [saving(sub) for sub in subs])
+
+
+class Rows(NamedTuple):
+    """What one of the savings has saved: times, how many rows are used, their cotangents."""
+
+    times: Float[Array, " rows"]
+    count: IntScalar
+    cotangents: Any  # leading axis: rows
+
+
+class _Block(NamedTuple):
+    """Consecutive steps, the first of which is number `first`."""
+
+    first: IntScalar
+    starts: Float[Array, " steps"]
+    ends: Float[Array, " steps"]
+    states: Y  # leading axis: steps
+
+
+class _Gradient(NamedTuple):
+    """With respect to the current state, and to the leaves of the functions so far."""
+
+    y: Y
+    leaves: Any
+
+
+def replay_backwards(
+    replay: Replay,
+    perturbed: Any,
+    record: Record,
+    num_steps: IntScalar,
+    rows: list[Rows],
+    y0: Y,
+    last: tuple[RealScalarLike, Y],
+) -> tuple[Any, Y]:
+    """Gradients with respect to the leaves of `replay` and to `y0`."""
+    leaves, rest = eqx.partition(replay, perturbed)
+    back = _Backwards(leaves, rest, record, num_steps, rows)
+    gradient = _Gradient(*jtu.tree_map(jnp.zeros_like, (y0, leaves)))
+    gradient = back.through_end(gradient, *last)
+    total = unvmap_max(num_steps)
+    num_blocks = -(-total // record.block)
+
+    def through_block(carry):
+        i, gradient = carry
+        return i - 1, back.through_block(gradient, back.block(i - 1), total)
+
+    _, gradient = lax.while_loop(lambda carry: carry[0] > 0, through_block, (num_blocks, gradient))
+    gradient = back.through_start(gradient, record.starts[0], y0)
+    return gradient.leaves, gradient.y
+
+
+class _Backwards(eqx.Module):
+    leaves: Any
+    rest: Any
+    record: Record
+    num_steps: IntScalar
+    rows: list[Rows]
+
+    def through_end(self, gradient: _Gradient, t: RealScalarLike, y: Y) -> _Gradient:
+        for k, saving in enumerate(self.rest.savings):
+            if saving.end:
+                unsaved = saving.steps == 0 or self.num_steps % saving.steps != 0
+                last = jnp.arange(len(self.rows[k].times)) == self.rows[k].count - 1
+                gradient = self._add_rows(gradient, k, last & unsaved, t, y)
+        return gradient
+
+    def through_start(self, gradient: _Gradient, t: RealScalarLike, y0: Y) -> _Gradient:
+        """The row of `t0`; without any step (`t0 == t1`) those of `ts` are copies of it."""
+        for k, saving in enumerate(self.rest.savings):
+            row = jnp.arange(len(self.rows[k].times))
+            copies = jnp.where(self.num_steps == 0, saving.num_times, 0)
+            gradient = self._add_rows(gradient, k, row < saving.offset + copies, t, y0)
+        return gradient
+
+    def _add_rows(
+        self, gradient: _Gradient, k: int, used: Bool[Array, " rows"], t: RealScalarLike, y: Y
+    ) -> _Gradient:
+        """The rows of saving `k` that are the same function of one state."""
+
+        def value(leaves: Any, y: Y) -> Any:
+            return self._replay(leaves).savings[k].at_state(t, y)
+
+        bar = jtu.tree_map(lambda b: jnp.sum(_only(used, b), axis=0), self.rows[k].cotangents)
+        _, pullback = jax.vjp(value, self.leaves, y)
+        leaves_bar, y_bar = pullback(bar)
+        add = lambda a, b: jtu.tree_map(jnp.add, a, b)
+        return _Gradient(add(gradient.y, y_bar), add(gradient.leaves, leaves_bar))
+
+    def _replay(self, leaves: Any) -> Replay:
+        return eqx.combine(leaves, self.rest)
+
+    def block(self, i: IntScalar) -> _Block:
+        record = self.record
+        first = i * record.block
+        live = first + jnp.arange(record.block) < self.num_steps
+        take = lambda x: lax.dynamic_slice_in_dim(x, first, record.block)
+        # Rows of no step hold the first one: functions may refuse what is not a state or time.
+        used = lambda x: jnp.where(live.reshape(live.shape + (1,) * (x.ndim - 1)), take(x), x[0])
+        starts, ends = used(record.starts), used(record.ends)
+        if record.stride == 1:
+            return _Block(first, starts, ends, jtu.tree_map(used, record.states))
+
+        def advance(y, xs):
+            start, end, live = xs
+            y1, _ = self._replay(self.leaves).step(start, end, y)
+            keep = lambda a, b: jnp.where(live, a, b)
+            return jtu.tree_map(keep, y1, y), y
+
+        start = jtu.tree_map(lambda y: y[i], record.states)
+        _, states = lax.scan(advance, start, (starts, ends, live))
+        return _Block(first, starts, ends, states)
+
+    def through_block(self, gradient: _Gradient, block: _Block, total: IntScalar) -> _Gradient:
+        size = block.starts.shape[0]
+        bars, leaves = jtu.tree_map(jnp.zeros_like, block.states), gradient.leaves
+        for k, saving in enumerate(self.rest.savings):
+            if saving.num_times:
+                bars, leaves = self._interpolated(k, block, bars, leaves)
+
+        def through_step(carry):
+            i, gradient = carry
+            i = i - 1
+            return i, self._through_step(gradient, block, bars, i)
+
+        start = jnp.minimum(total - block.first, size), _Gradient(gradient.y, leaves)
+        return lax.while_loop(lambda carry: carry[0] > 0, through_step, start)[1]
+
+    def _through_step(self, gradient: _Gradient, block: _Block, bars: Y, i: IntScalar) -> _Gradient:
+        number = block.first + i + 1  # of accepted steps after this one
+        live = number <= self.num_steps
+        at = lambda tree: jtu.tree_map(lambda x: x[i], tree)
+
+        def saved_bar(saving: Saving, rows: Rows) -> Any:
+            if not saving.steps:
+                return None
+            row = saving.offset + number // saving.steps - 1
+            saved = live & (number % saving.steps == 0)
+            return jtu.tree_map(lambda b: jnp.where(saved, b[row], 0), rows.cotangents)
+
+        saved = [saved_bar(s, r) for s, r in zip(self.rest.savings, self.rows, strict=True)]
+        step = lambda leaves, y: self._replay(leaves).step(block.starts[i], block.ends[i], y)
+        _, pullback = jax.vjp(step, self.leaves, at(block.states))
+        leaves_bar, y_bar = pullback((gradient.y, saved))
+        return _Gradient(
+            jtu.tree_map(
+                lambda new, old, b: jnp.where(live, new, old) + b, y_bar, gradient.y, at(bars)
+            ),
+            jtu.tree_map(lambda a, b: a + jnp.where(live, b, 0), gradient.leaves, leaves_bar),
+        )
+
+    def _interpolated(self, k: int, block: _Block, bars: Y, leaves: Any) -> tuple[Y, Any]:
+        """Cotangents of the rows interpolated in this block, with respect to the states from
+        which its steps were made, and to the leaves."""
+        saving, rows = self.rest.savings[k], self.rows[k]
+        size = block.starts.shape[0]
+        row = jnp.arange(len(rows.times))
+        step = jnp.searchsorted(self.record.ends, rows.times).astype(self.num_steps.dtype)
+        valid = (row >= saving.offset) & (row < saving.offset + saving.num_times)
+        valid &= (row < rows.count) & (step < self.num_steps)
+        first = saving.offset + jnp.sum(valid & (step < block.first))
+        count = jnp.sum(valid & (step >= block.first) & (step < block.first + size))
+
+        def chunk(carry):
+            c, bars, leaves = carry
+            index = c * _CHUNK + jnp.arange(min(_CHUNK, len(rows.times)))
+            used = index < count
+            index = jnp.where(used, first + index, first)
+            bars, leaves_bar = self._chunk(k, block, bars, index, step[index] - block.first, used)
+            leaves = jtu.tree_map(lambda a, b: a + jnp.where(count > 0, b, 0), leaves, leaves_bar)
+            return c + 1, bars, leaves
+
+        num_chunks = unvmap_max(-(-count // _CHUNK))
+        start = jnp.zeros_like(num_chunks), bars, leaves
+        return lax.while_loop(lambda carry: carry[0] < num_chunks, chunk, start)[1:]
+
+    def _chunk(
+        self,
+        k: int,
+        block: _Block,
+        bars: Y,
+        index: Int[Array, " chunk"],
+        step: Int[Array, " chunk"],
+        used: Bool[Array, " chunk"],
+    ) -> tuple[Y, Any]:
+        bar = jtu.tree_map(lambda b: _only(used, b[index]), self.rows[k].cotangents)
+        t, start, end = self.rows[k].times[index], block.starts[step], block.ends[step]
+
+        def values(leaves, states):
+            f = self._replay(leaves).savings[k].in_step
+            return jax.vmap(f)(t, start, end, states)
+
+        _, pullback = jax.vjp(values, self.leaves, jtu.tree_map(lambda y: y[step], block.states))
+        leaves_bar, states_bar = pullback(bar)
+        add = lambda b, s: b.at[step].add(_only(used, s))
+        return jtu.tree_map(add, bars, states_bar), leaves_bar
+
+
+def _only(used: Bool[Array, " rows"], x: Float[Array, "rows ..."]) -> Float[Array, "rows ..."]:
+    """The rows that are used, zeros for the others, whatever they hold."""
+    return jnp.where(used.reshape(used.shape + (1,) * (x.ndim - 1)), x, 0)

@@ -1,0 +1,396 @@
+"""Reverse mode by replaying recorded steps: the gradient of Diffrax, by another way."""
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import manifold_jax as mj
+
+
+THETA = jnp.array([9.81, 1.1, 0.8])
+CONTROLLER = dfx.PIDController(rtol=1e-6, atol=1e-6)
+RELEASED = (jnp.array([0.8, -0.6]), jnp.array([0.3, 0.4]))
+
+
+def pendulum_field(t, y, gravity):
+    q, v = y
+    mu = (v @ v - gravity * q[1]) / (q @ q)
+    return v, -mu * q - gravity * jnp.array([0.0, 1.0])
+
+
+def saved(theta, adjoint, hook, saveat, solver, t1=2.0, controller=CONTROLLER, max_steps=200):
+    """A pendulum of gravity and length `theta[:2]`, started with the speed `theta[2]`."""
+    gravity, length, speed = theta
+    # the length is closed over, gravity an argument
+    circle = mj.Constraint(lambda t, y, args: jnp.stack([y[0] @ y[0] - length**2, y[0] @ y[1]]))
+    if hook is None:
+        wrapped = solver
+    elif hook is mj.Stabilized:
+        gain = mj.InvariantStabilization(5.0)
+        wrapped = mj.Stabilized(solver, circle, stabilization=gain)
+    elif isinstance(hook, mj.CoordinatePartitionChart):
+        wrapped = mj.LocalCoordinates(solver, circle, chart=hook)
+    else:
+        wrapped = hook(solver, circle)
+    y0 = (length * RELEASED[0], speed * jnp.stack([RELEASED[0][1], -RELEASED[0][0]]))
+    return mj.diffeqsolve(
+        dfx.ODETerm(pendulum_field),
+        wrapped,
+        0.0,
+        t1,
+        0.03 if controller is not CONTROLLER else None,
+        y0,
+        gravity,
+        saveat=saveat,
+        adjoint=adjoint,
+        stepsize_controller=controller,
+        max_steps=max_steps,
+    )
+
+
+def loss(theta, adjoint, *rest, **options):
+    sol = saved(theta, adjoint, *rest, **options)
+    total = 0.0
+    for i, y in enumerate(jax.tree.leaves(sol.ys)):
+        used = jnp.isfinite(y)
+        weights = jnp.cos(jnp.arange(y.size) + i).reshape(y.shape)
+        total += jnp.sum(weights * jnp.where(used, jnp.where(used, y, 0.0) ** 2, 0.0))
+    return total
+
+
+def gradients(*case, replay=None, **options):
+    replay = mj.StepReplayAdjoint() if replay is None else replay
+    reverse = jax.jit(jax.grad(lambda theta: loss(theta, replay, *case, **options)))(THETA)
+    forward = lambda theta: loss(theta, dfx.ForwardMode(), *case, **options)
+    return reverse, jax.jit(jax.jacfwd(forward))(THETA)
+
+
+def agree(reverse, forward):
+    np.testing.assert_allclose(reverse, forward, rtol=1e-11, atol=1e-12 * np.abs(forward).max())
+    assert np.abs(forward).min() > 1e-3
+
+
+TIMES = jnp.linspace(0.0, 1.9, 77)
+SAVEATS = {
+    "t1": dfx.SaveAt(t1=True),
+    "t0, ts, t1": dfx.SaveAt(t0=True, ts=TIMES, t1=True),
+    "steps": dfx.SaveAt(steps=True),
+    "t0, every third step, t1": dfx.SaveAt(t0=True, steps=3, t1=True),
+    "subs with functions": dfx.SaveAt(
+        subs=[
+            dfx.SubSaveAt(ts=TIMES, fn=lambda t, y, args: t * args + y[0] @ y[0]),
+            dfx.SubSaveAt(steps=True, fn=lambda t, y, args: y[1] * y[0][0] * args),
+            dfx.SubSaveAt(t0=True, t1=True),
+        ]
+    ),
+}
+
+
+slow = lambda *values: pytest.param(*values, marks=pytest.mark.slow)
+
+
+@pytest.mark.parametrize(
+    ("name", "checkpoints"),
+    [
+        ("subs with functions", None),
+        ("t0, every third step, t1", 200),
+        *(slow(name, checkpoints) for name in SAVEATS for checkpoints in (None, 7, 200)),
+    ],
+)
+def test_every_way_of_saving(name, checkpoints):
+    agree(
+        *gradients(
+            mj.Projected,
+            SAVEATS[name],
+            dfx.Tsit5(),
+            replay=mj.StepReplayAdjoint(checkpoints=checkpoints),
+        )
+    )
+
+
+HOOKS = {
+    "plain": None,
+    "stabilized": mj.Stabilized,
+    "tangent space": mj.LocalCoordinates,
+    "coordinate partition": mj.CoordinatePartitionChart(),
+}
+
+
+@pytest.mark.parametrize("hook", [slow(h) if h != "stabilized" else h for h in HOOKS])
+def test_every_approach(hook):
+    agree(*gradients(HOOKS[hook], SAVEATS["t0, ts, t1"], dfx.Dopri5()))
+
+
+@pytest.mark.parametrize("solver", [slow(dfx.Dopri8()), slow(dfx.Kvaerno5()), dfx.Heun()], ids=str)
+def test_solvers(solver):
+    """Steps in a loop, implicit stages, and constant steps."""
+    controller = dfx.ConstantStepSize() if isinstance(solver, dfx.Heun) else CONTROLLER
+    agree(*gradients(mj.Projected, SAVEATS["t0, ts, t1"], solver, controller=controller))
+
+
+def test_backwards_in_time():
+    agree(*gradients(mj.Projected, SAVEATS["t1"], dfx.Tsit5(), t1=-2.0))
+
+
+def test_equal_to_recursive_checkpointing_with_given_steps():
+    options = dict(controller=dfx.StepTo(ts=jnp.linspace(0.0, 2.0, 60)))
+    case = (mj.Projected, SAVEATS["t0, ts, t1"], dfx.Tsit5())
+
+    def gradient(adjoint):
+        # StepTo takes no first step
+        def objective(theta):
+            gravity, length, speed = theta
+            problem = mj.problems.pendulum(gravity=gravity, length=length)
+            sol = mj.diffeqsolve(
+                problem.terms,
+                mj.Projected(dfx.Tsit5(), problem.constraint),
+                0.0,
+                2.0,
+                None,
+                (problem.y0[0], problem.y0[1] + speed * jnp.array([0.0, 1.0])),
+                problem.args,
+                saveat=case[1],
+                adjoint=adjoint,
+                stepsize_controller=options["controller"],
+            )
+            return jnp.sum(jnp.sin(sol.ys[0]) * sol.ys[1])
+
+        return jax.jit(jax.grad(objective))(THETA)
+
+    replayed, checkpointed = (
+        gradient(mj.StepReplayAdjoint()),
+        gradient(dfx.RecursiveCheckpointAdjoint()),
+    )
+    np.testing.assert_allclose(replayed, checkpointed, rtol=1e-12)
+
+
+def test_batch_equals_single():
+    """Lanes with different numbers of steps; their common loop is as long as the longest."""
+    thetas = jnp.stack([THETA, THETA * jnp.array([3.0, 0.5, 2.0]), THETA * 0.3])
+    case = (mj.Projected, SAVEATS["t0, ts, t1"], dfx.Tsit5())
+    gradient = jax.grad(lambda theta: loss(theta, mj.StepReplayAdjoint(), *case))
+    batch = jax.jit(jax.vmap(gradient))(thetas)
+    single = jax.jit(gradient)
+    for theta, row in zip(thetas, batch):
+        np.testing.assert_allclose(row, single(theta), rtol=1e-11)
+
+
+def test_one_counter_for_the_whole_batch():
+    """A batched loop counter would make every access to the record a gather."""
+    case = (mj.Projected, SAVEATS["t1"], dfx.Tsit5())
+    gradient = jax.vmap(jax.grad(lambda theta: loss(theta, mj.StepReplayAdjoint(), *case)))
+    jaxpr = jax.make_jaxpr(gradient)(jnp.stack([THETA, THETA])).jaxpr
+    counters = [
+        loop.params["body_jaxpr"].in_avals[loop.params["body_nconsts"]].shape
+        for loop in loops(jaxpr)
+    ]
+    assert len(counters) > 3
+    assert set(counters[-4:-2]) == {()} or () in counters
+
+
+def loops(jaxpr):
+    for equation in jaxpr.eqns:
+        if equation.primitive.name == "while":
+            yield equation
+        for value in equation.params.values():
+            if hasattr(value, "jaxpr"):
+                yield from loops(value.jaxpr)
+
+
+@pytest.mark.slow
+def test_hessian_vector_product():
+    """Forward over the replay: the loops back are differentiable forwards."""
+    case = (mj.Projected, SAVEATS["t1"], dfx.Tsit5())
+    direction = jnp.array([0.3, -0.2, 0.5])
+
+    def along(gradient):
+        return jax.jit(lambda theta: jax.jvp(gradient, (theta,), (direction,))[1])(THETA)
+
+    replayed = along(jax.grad(lambda theta: loss(theta, mj.StepReplayAdjoint(), *case)))
+    forward = along(jax.jacfwd(lambda theta: loss(theta, dfx.ForwardMode(), *case)))
+    np.testing.assert_allclose(replayed, forward, rtol=1e-10)
+
+
+def test_no_steps():
+    """`t0 == t1`: everything saved is the start."""
+    case = (mj.Projected, dfx.SaveAt(ts=jnp.zeros(3)), dfx.Tsit5())
+    reverse, forward = gradients(*case, t1=0.0, controller=dfx.ConstantStepSize())
+    np.testing.assert_allclose(reverse, forward, rtol=1e-12)
+    assert reverse[0] == 0  # of gravity
+    assert np.abs(reverse[1:]).min() > 0.1
+
+
+def test_stochastic():
+    """Brownian motion is a function of time, and the same on the way back."""
+    problem = mj.problems.sphere_flow()
+    noise = dfx.VirtualBrownianTree(0.0, 1.0, 1e-3, (), jax.random.key(0))
+
+    def end(scale, adjoint):
+        diffusion = dfx.ControlTerm(
+            lambda t, y, args: 0.3 * scale * (y @ y) * jnp.roll(y, 1) - y * (y @ jnp.roll(y, 1)),
+            noise,
+        )
+        sol = mj.diffeqsolve(
+            dfx.MultiTerm(problem.terms, diffusion),
+            mj.Projected(dfx.Heun(), problem.constraint),
+            0.0,
+            1.0,
+            0.05,
+            problem.y0,
+            problem.args,
+            adjoint=adjoint,
+        )
+        return sol.ys[0] @ jnp.arange(1.0, 1 + problem.y0.size)
+
+    reverse = jax.grad(end)(1.0, mj.StepReplayAdjoint())
+    np.testing.assert_allclose(reverse, jax.jacfwd(end)(1.0, dfx.ForwardMode()), rtol=1e-11)
+
+
+def refused(match, error=ValueError, adjoint=None, **options):
+    problem = mj.problems.pendulum()
+    arguments = dict(saveat=dfx.SaveAt(t1=True), max_steps=100)
+    with pytest.raises(error, match=match):
+        mj.diffeqsolve(
+            problem.terms,
+            mj.Projected(dfx.Tsit5(), problem.constraint),
+            0.0,
+            1.0,
+            0.1,
+            problem.y0,
+            problem.args,
+            adjoint=mj.StepReplayAdjoint() if adjoint is None else adjoint,
+            **(arguments | options),
+        )
+
+
+def test_refusals():
+    refused("`event`", event=dfx.Event(lambda t, y, args, **kw: y[0][0]))
+    refused("`max_steps`", max_steps=None)
+    both = dfx.SaveAt(ts=jnp.array([0.5]), steps=True)
+    refused("`ts` and `steps`", saveat=both)
+    with pytest.raises(ValueError, match="`checkpoints`"):
+        mj.StepReplayAdjoint(checkpoints=0)
+
+
+def test_times_are_not_differentiated_silently():
+    problem = mj.problems.pendulum()
+
+    def end(t1, saveat):
+        sol = mj.diffeqsolve(
+            problem.terms,
+            mj.Projected(dfx.Tsit5(), problem.constraint),
+            0.0,
+            t1,
+            0.1,
+            problem.y0,
+            problem.args,
+            saveat=saveat,
+            adjoint=mj.StepReplayAdjoint(),
+        )
+        return sol.ys[0][0, 0]
+
+    with pytest.raises(RuntimeError, match="time or step size"):
+        jax.grad(lambda t1: end(t1, dfx.SaveAt(t1=True)))(1.0)
+    with pytest.raises(RuntimeError, match="time or step size"):
+        jax.grad(lambda t: end(1.0, dfx.SaveAt(ts=t[None])))(jnp.asarray(0.5))
+
+
+def test_forward_mode_is_refused():
+    case = (mj.Projected, SAVEATS["t1"], dfx.Tsit5())
+    with pytest.raises(TypeError, match="custom_vjp"):
+        jax.jacfwd(lambda theta: loss(theta, mj.StepReplayAdjoint(), *case))(THETA)
+
+
+def test_dense_solution_is_not_differentiated_silently():
+    problem = mj.problems.pendulum()
+
+    def value(gravity):
+        sol = mj.diffeqsolve(
+            problem.terms,
+            mj.Projected(dfx.Tsit5(), problem.constraint),
+            0.0,
+            1.0,
+            0.1,
+            problem.y0,
+            problem.args._replace(gravity=gravity),
+            saveat=dfx.SaveAt(dense=True),
+            max_steps=20,
+            adjoint=mj.StepReplayAdjoint(),
+        )
+        return sol.evaluate(0.5)[0][0]
+
+    assert np.isfinite(value(9.81))
+    with pytest.raises(RuntimeError, match="dense solution"):
+        jax.grad(value)(9.81)
+
+
+def test_steps_across_jumps_of_the_field():
+    """The state after a jump starts a new step just behind it."""
+
+    def end(theta, adjoint):
+        field = lambda t, y, args: theta * jnp.where(t < 0.5, 1.0, -3.0) * jnp.stack([-y[1], y[0]])
+        controller = dfx.ClipStepSizeController(
+            dfx.PIDController(rtol=1e-8, atol=1e-8), jump_ts=jnp.array([0.5])
+        )
+        circle = mj.Constraint(lambda t, y, args: y @ y - 1.0)
+        sol = mj.diffeqsolve(
+            dfx.ODETerm(field),
+            mj.Projected(dfx.Tsit5(), circle),
+            0.0,
+            1.0,
+            0.1,
+            jnp.array([1.0, 0.0]),
+            stepsize_controller=controller,
+            adjoint=adjoint,
+        )
+        return sol.ys[0, 1]
+
+    reverse = jax.grad(end)(1.0, mj.StepReplayAdjoint())
+    np.testing.assert_allclose(reverse, jax.jacfwd(end)(1.0, dfx.ForwardMode()), rtol=1e-11)
+    np.testing.assert_allclose(reverse, -np.cos(1.0), rtol=1e-6)  # y(1) = -sin(theta)
+
+
+@pytest.mark.slow
+def test_network_as_vector_field():
+    """Many parameters: leaves of a module inside the terms."""
+    network = eqx.nn.MLP(3, 3, 8, 2, key=jax.random.key(1))
+    sphere = mj.Constraint(lambda t, y, args: y @ y - 1.0)
+
+    def end(network, adjoint):
+        field = lambda t, y, args: jnp.cross(network(y), y)
+        sol = mj.diffeqsolve(
+            dfx.ODETerm(field),
+            mj.Projected(dfx.Tsit5(), sphere),
+            0.0,
+            3.0,
+            None,
+            jnp.array([0.6, 0.0, 0.8]),
+            stepsize_controller=CONTROLLER,
+            saveat=dfx.SaveAt(ts=jnp.linspace(0.0, 3.0, 9)),
+            adjoint=adjoint,
+        )
+        return jnp.sum(sol.ys[:, 0] * jnp.arange(9.0))
+
+    replayed = eqx.filter_grad(end)(network, mj.StepReplayAdjoint())
+    checkpointed = eqx.filter_grad(end)(network, dfx.RecursiveCheckpointAdjoint())
+    for a, b in zip(jax.tree.leaves(replayed), jax.tree.leaves(checkpointed)):
+        np.testing.assert_allclose(a, b, rtol=1e-8, atol=1e-10)
+
+
+@pytest.mark.slow
+def test_memory_does_not_grow_with_the_states():
+    """Compiled, the room for states is `checkpoints` and one block, whatever `max_steps`."""
+    case = (mj.Projected, SAVEATS["t1"], dfx.Tsit5())
+
+    def bytes_needed(max_steps, checkpoints):
+        adjoint = mj.StepReplayAdjoint(checkpoints=checkpoints)
+        f = jax.jit(jax.grad(lambda theta: loss(theta, adjoint, *case, max_steps=max_steps)))
+        return f.lower(THETA).compile().memory_analysis().temp_size_in_bytes
+
+    few, many = bytes_needed(2**14, 128), bytes_needed(2**14, 2**14)
+    times, state = 2 * 8 * 2**14, 4 * 8
+    assert few < times + 2 * 2 * 128 * state + 50_000
+    assert many > times + 2**14 * state
