@@ -4,6 +4,12 @@ from importlib.metadata import version
 
 from . import problems as problems
 from ._adjoint import StepReplayAdjoint as StepReplayAdjoint
+from ._applications import (
+    ConstrainedMinimum as ConstrainedMinimum,
+    CurveTrace as CurveTrace,
+    gradient_flow as gradient_flow,
+    trace_curve as trace_curve,
+)
 from ._chart import (
     CoordinatePartitionChart as CoordinatePartitionChart,
     TangentSpaceChart as TangentSpaceChart,

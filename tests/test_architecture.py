@@ -27,6 +27,7 @@ LAYERS = [
     {"_adjoint"},
     {"_output"},
     {"_diffeqsolve"},
+    {"_applications"},
     {"problems"},
     {"__init__"},
     {"_compare"},

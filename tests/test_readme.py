@@ -32,6 +32,15 @@ def test_mechanism_example_runs():
     assert namespace["forces"].shape == (2,)
 
 
+def test_curves_and_minima_example_runs():
+    with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
+        namespace = {"jnp": jax.numpy, "mj": manifold_jax}
+        exec(compile(blocks()[2], str(README), "exec"), namespace)
+    np.testing.assert_allclose(namespace["folds"], [[-1, -2 / 3], [1, 2 / 3]], atol=1e-14)
+    np.testing.assert_allclose(namespace["minimum"].x, [-1, 0, 0], atol=1e-14)
+    np.testing.assert_allclose(namespace["minimum"].multipliers, [0.5], rtol=1e-14)
+
+
 def test_example_runs_and_keeps_the_manifold(example):
     with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
         namespace = {}

@@ -1,0 +1,2 @@
+from .curve import CurveTrace as CurveTrace, trace_curve as trace_curve
+from .optimization import ConstrainedMinimum as ConstrainedMinimum, gradient_flow as gradient_flow
