@@ -36,7 +36,7 @@ def test_stale_first_same_as_last_stage(solver):
 
 @pytest.mark.parametrize(
     "solver",
-    [dfx.Kvaerno5(dfx.VeryChord(rtol=1e-12, atol=1e-12)), dfx.HalfSolver(dfx.Tsit5())],
+    [dfx.Kvaerno5(root_finder=dfx.VeryChord(rtol=1e-12, atol=1e-12)), dfx.HalfSolver(dfx.Tsit5())],
     ids=lambda solver: type(solver).__name__,
 )
 def test_stale_derivative_of_a_solver_with_its_own_stages(solver):
