@@ -145,6 +145,76 @@ def compare(
 
 
 @app.command()
+def certify(
+    problem: Annotated[
+        str, typer.Argument(metavar="PROBLEM", help="Name of the problem, see `manifold-jax list`.")
+    ],
+    methods: Annotated[
+        str,
+        typer.Option(
+            metavar="NAME,...",
+            help="plain, projected, one-step, invariant, exact, baumgarte, tangent, partition.",
+        ),
+    ] = "projected,invariant,tangent",
+    solvers: Annotated[
+        str, typer.Option(metavar="NAME,...", help="Adaptive solvers of Diffrax, as in `compare`.")
+    ] = "tsit5",
+    adjoints: Annotated[
+        str,
+        typer.Option(
+            metavar="NAME,...", help="forward, checkpointed, replay, direct, backsolve (refused)."
+        ),
+    ] = "forward,checkpointed,replay,backsolve",
+    tolerance: Annotated[float, typer.Option(help="Of the steps, relative and absolute.")] = 1e-6,
+    t1: Annotated[
+        float | None,
+        typer.Option(metavar="T", help="End of the time span, by default that of the problem."),
+    ] = None,
+    json: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Write the table as JSON, too.")
+    ] = None,
+) -> None:
+    """Certify gradients: all ways to compute them, compared with each other and with differences.
+
+    What is differentiated is a weighted sum of the last state, with respect to the parameters
+    of the problem (its initial state if it has none); they enter the vector field, the
+    constraint and the initial state. The steps are those of one adaptive solve, given to all.
+
+    Prints for each approach and solver how far the gradients of the adjoints are from forward
+    mode (relative), Hessian-vector products from forward over forward, `vmap(grad)` from one at
+    a time, their time, and the memory of the compiled program; and how far finite differences
+    are (sixth order), the gradient of the exact solution, and sensitivities from tangent.
+
+    Exits with 1 if reverse and forward mode differ by more than 1e-10, or differences by more
+    than 1e-7.
+    """
+    task = _task(problem, "tsit5", tolerance, tolerance, t1, None)
+    _check_target(json, "--json", None)
+    from ._certify import ADJOINTS, certificate_table, combinations, is_certified, write_json
+    from ._compare.approaches import APPROACHES
+    from ._compare.with_diffrax import SOLVERS
+
+    known = {approach.name: approach for approach in APPROACHES}
+    chosen = [known[name] for name in _names(methods, known, "method", "--methods")]
+    steppers = [SOLVERS[name]() for name in _names(solvers, SOLVERS, "solver", "--solvers")]
+    ways = {n: ADJOINTS[n] for n in _names(adjoints, ADJOINTS, "adjoint", "--adjoints")}
+    rows = []
+    with _progress() as progress:
+        status = progress.add_task("")
+        for name, row in combinations(task, chosen, steppers, ways):
+            progress.update(status, description=f"{task.problem.name}: {name}")
+            if row is not None:
+                rows.append(row)
+    if json is not None:
+        write_json(
+            json, {"problem": task.problem.name, "t1": task.t1, "tolerance": tolerance}, rows
+        )
+    _output().print(certificate_table(rows))
+    if not all(is_certified(row) for row in rows):
+        raise typer.Exit(1)
+
+
+@app.command()
 def paper() -> None:
     """Reprint Table 1 of the paper: Euler's method on a circle, plain and projected.
 
@@ -197,9 +267,7 @@ def _choose(names: str | None, task: "Task") -> tuple[list["Method"], list["Meth
     from ._compare.methods import METHODS
 
     known = [method.key for method in METHODS]
-    asked = known if names is None else [name.strip().lower() for name in names.split(",")]
-    for name in asked:
-        _check_name(name, known, "method", "--methods")
+    asked = known if names is None else _names(names, known, "method", "--methods")
     methods = [method for method in METHODS if method.key in asked]
     chosen = [method for method in methods if method.applies_to(task)]
     if not chosen:
@@ -208,6 +276,14 @@ def _choose(names: str | None, task: "Task") -> tuple[list["Method"], list["Meth
             param_hint="--methods",
         )
     return chosen, [method for method in methods if method not in chosen]
+
+
+def _names(text: str, known: Iterable[str], kind: str, hint: str) -> list[str]:
+    """A list separated by commas, all of known names."""
+    names = [name.strip().lower() for name in text.split(",")]
+    for name in names:
+        _check_name(name, known, kind, hint)
+    return names
 
 
 def _check_name(name: str, known: Iterable[str], kind: str, hint: str) -> None:

@@ -31,6 +31,7 @@ LAYERS = [
     {"problems"},
     {"__init__"},
     {"_compare"},
+    {"_certify"},
     {"_cli"},
     {"__main__"},
 ]
