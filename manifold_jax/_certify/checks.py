@@ -140,7 +140,7 @@ def _check(
         return Check(name, refused=str(error).strip().splitlines()[0])
     compile_s = time.perf_counter() - start
     analysis = compiled.memory_analysis()
-    several = theta * jnp.asarray([[1.0], [1.001], [0.999]], theta.dtype)
+    several = jnp.stack([theta, 1.001 * theta, 0.999 * theta])
     batch = jax.jit(jax.vmap(gradient))(several)
     return Check(
         name,
