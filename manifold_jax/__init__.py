@@ -20,6 +20,7 @@ from ._constraint import (
     Invariants as Invariants,
 )
 from ._diffeqsolve import diffeqsolve as diffeqsolve
+from ._fit import fit as fit, FitResult as FitResult
 from ._initial import consistent_state as consistent_state
 from ._mechanics import (
     Baumgarte as Baumgarte,

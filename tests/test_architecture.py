@@ -28,6 +28,7 @@ LAYERS = [
     {"_output"},
     {"_diffeqsolve"},
     {"_applications"},
+    {"_fit"},
     {"problems"},
     {"__init__"},
     {"_compare"},

@@ -41,6 +41,15 @@ def test_curves_and_minima_example_runs():
     np.testing.assert_allclose(namespace["minimum"].multipliers, [0.5], rtol=1e-14)
 
 
+def test_fit_example_runs():
+    with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
+        namespace = {"jax": jax, "jnp": jax.numpy, "mj": manifold_jax}
+        exec(compile(blocks()[3], str(README), "exec"), namespace)
+    fit = namespace["fit"]
+    assert abs(fit.parameters["gravity"] - 9.81) < 3 * fit.standard_errors["gravity"] < 0.02
+    assert abs(fit.parameters["length"] - 1) < 3 * fit.standard_errors["length"] < 0.002
+
+
 def test_example_runs_and_keeps_the_manifold(example):
     with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
         namespace = {}

@@ -1,0 +1,182 @@
+"""The front end: parameters of an equation on a manifold from measured trajectories."""
+
+from collections.abc import Callable
+from typing import Any
+
+import diffrax as dfx
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import optax
+import optimistix as optx
+
+from .data import check_times, make_records
+from .model import check_solver, Simulator
+from .optimize import look, optimize, Options
+from .parameters import make_transform
+from .pieces import make_pieces
+from .report import FitResult
+from .setup import check_amount, check_initial, check_options, make_objective, with_scales
+from .summary import summarize
+
+
+# Unknowns of one trajectory beyond which one reverse sweep is cheaper than a forward sweep for each.
+_MANY_UNKNOWNS = 50
+
+
+def fit(
+    model: Any,
+    parameters: Any,
+    ts: Any,
+    data: Any,
+    *,
+    y0: Any = None,
+    t0: Any = None,
+    observe: Callable | None = None,
+    sigma: Any = None,
+    missing: str | None = None,
+    bounds: Any = None,
+    positive: Any = False,
+    fit_initial: bool = False,
+    loss: Callable | None = None,
+    optimizer: Any = None,
+    steps: int = 200,
+    patience: int = 20,
+    batch_size: int | None = None,
+    seed: int = 0,
+    segments: int = 1,
+    states: Any = None,
+    solver: Any = dfx.Tsit5(),  # noqa: B008
+    stepsize_controller: dfx.AbstractStepSizeController | None = None,
+    dt0: Any = None,
+    max_steps: int | None = 4096,
+    progress: bool = False,
+    throw: bool = True,
+) -> FitResult:
+    r"""Fit parameters to measured trajectories, by default by weighted least squares:
+
+    $$\min_\theta \tfrac12 \sum_{r,i,j}
+    \left(\frac{h_j(t_i, y_r(t_i; \theta), \theta) - d_{rij}}{\sigma_{rij}}\right)^2.$$
+
+    ```python
+    problem = mj.problems.pendulum()
+    start = {"gravity": 8.0, "length": 1.3}
+    result = mj.fit(problem, start, ts, (q_measured, v_measured), sigma=0.01)
+    print(result)
+    ```
+
+    Parameters may be anywhere: in the vector field, inside the constraint, in the initial
+    state. The problem is rebuilt from them inside the function that is differentiated, so that
+    sensitivities are complete.
+
+    **Arguments:**
+
+    - `model`: a problem of the gallery (`parameters` is then a dictionary with some of the
+        fields of its `args`); an [`MechanicalSystem`][] (`parameters` is then its `args`); or a
+        function of the parameters that returns one of these or `(terms, constraint)`, which get
+        the parameters as `args`. Define such a function once: calls with the same one share
+        compiled code. [`Invariants`][] are frozen anew at the initial state of each solve.
+    - `parameters`: the values to start from, any pytree of real numbers and arrays, `p` in all.
+    - `ts`: increasing times of the measurements, shape `(times,)`; or `(records, times)` for
+        many trajectories with the same parameters.
+    - `data`: what was measured at `ts`, like the state (or what `observe` returns), leaves
+        with a leading axis `(times,)` or `(records, times)`.
+    - `y0`: the initial state at `t0`, with a leading axis `(records,)` if there are many; or a
+        function `y0(parameters)`. It is moved onto the manifold. Default: that of the problem.
+    - `t0`: the time of `y0`, by default the problem's, otherwise the first of `ts`.
+    - `observe`: `h(t, y, parameters)`, any pytree. Default: the whole state.
+    - `sigma`: standard deviations of the measurements, in the units of `data`: a number, or the structure of
+        `data`. If `None`, all are taken as equal and estimated from the residuals.
+    - `missing`: `"nan"` says that values that are NaN were not measured; otherwise refused.
+    - `bounds`: `(lower, upper)`, each a number or like `parameters`; `positive`: `True`, or
+        like `parameters`, for a lower bound of 0. Kept by a change of variables; a positive
+        parameter is searched for on a logarithmic scale.
+    - `fit_initial`: whether initial states are unknown, too, each with as many unknowns as the
+        manifold has dimensions; `y0` is then the guess, near enough to be left along the
+        tangent space. The matrices grow with the number of records.
+    - `loss`: instead of squares, `loss(prediction, data, weights)` of one record, to be summed
+        over records; `weights` are `1 / sigma`, and 0 where a value is missing.
+    - `optimizer`: an Optimistix least-squares solver (default: Levenberg-Marquardt) or
+        minimizer (`optx.BFGS`), or any Optax optimizer. Steps of the unknowns are
+        relative to the start values. Prefer the default, but Optax for more than about 50
+        parameters (then by reverse mode and without standard errors) or more records than can be
+        solved in each step.
+    - `steps`: the most of them; `patience`: stop after so many without a decrease.
+    - `batch_size`: with Optax, records in each step, in an order drawn with `seed`; `steps` then counts
+        passes through all records.
+    - `segments`: multiple shooting, into how many pieces to cut each record. The states where they
+        begin are further unknowns on the manifold, which meet the ends of the pieces before
+        them in the end. Use it for long records of oscillating or chaotic motion, where
+        single shooting ends in a local minimum; pieces of about one characteristic time.
+        Guesses of those states are taken from `data` if it is the state, else from `states`
+        (like the state with the leading axes of `ts`), else from a solve.
+    - `solver`: a Diffrax solver, wrapped in [`Projected`][], or a function of the constraint.
+    - `stepsize_controller`, `dt0`, `max_steps`: as for [`diffeqsolve`][]. The default tolerance
+        is 1e-8 (1e-5 in single precision).
+    - `progress`: whether to show a progress bar.
+    - `throw`: whether a fit that did not end well raises; otherwise look at `result.success`.
+
+    Not to be called inside `jit` or `vmap`: the optimizer's loop runs in Python, its steps are
+    compiled. A trajectory whose solve fails counts as a large constant: a step into such parameters is
+    rejected, and a record that fails all the time has no influence and is reported.
+
+    **Returns:**
+
+    A [`FitResult`][]: `parameters`, `standard_errors` and `covariance` (`s^2 (J^T J)^-1`
+    with the Jacobian `J` of the weighted residuals), history, report (`print`) and `plot`.
+
+    **Raises:**
+
+    `TypeError` or `ValueError` for arguments that cannot work; with `throw=True` a
+    `RuntimeError` if the optimizer did not converge.
+
+    Sources: Seber & Wild, Nonlinear Regression (1989); multiple shooting: Bock, in Numerical
+    Treatment of Inverse Problems in Differential and Integral Equations (1983), 95-121.
+    """
+    check_times(ts)
+    check_solver(solver)
+    many = np.ndim(ts) == 2
+    transform = make_transform(parameters, bounds, positive)
+    controller = _controller(stepsize_controller)
+    simulator = Simulator(model, y0, observe, solver, controller, dt0, max_steps, many)
+    check_initial(simulator, transform, np.shape(ts))
+    first = simulator.setting(transform.unravel(transform.start), 0)
+    seen = eqx.filter_eval_shape(
+        simulator.observation, jnp.zeros(()), first.y0, transform.unravel(transform.start)
+    )
+    t0 = getattr(model, "t0", None) if t0 is None and hasattr(model, "with_args") else t0
+    records = make_records(ts, data, sigma, missing, t0, seen)
+    optimizer = _default_optimizer() if optimizer is None else optimizer
+    options = Options(steps, patience, batch_size, seed, progress)
+    check_options(options, optimizer, loss, segments, records)
+    pieces = make_pieces(records, segments, simulator, transform, states, fit_initial)
+    reverse = isinstance(optimizer, optax.GradientTransformation) and (
+        transform.start.size + pieces.basis.shape[-1] > _MANY_UNKNOWNS
+    )
+    objective = make_objective(
+        simulator, transform, pieces, records, fit_initial, loss, seen, reverse
+    )
+    unknowns = transform.start.size + objective.free.size * pieces.basis.shape[-1]
+    check_amount(unknowns, objective)
+    u = jnp.zeros(unknowns, transform.start.dtype)
+    objective = with_scales(objective, look(u, objective, optimizer))
+    outcome = optimize(objective, u, optimizer, options)
+    result = summarize(objective, outcome, records, sigma is not None, seen)
+    if throw and not result.success:
+        raise RuntimeError(
+            f"The fit failed: {result.message}. Start closer, give `bounds`, allow more `steps`, or "
+            "cut long records into `segments`; with `throw=False` the result is returned."
+        )
+    return result
+
+
+def _default_optimizer() -> Any:
+    tolerance = 1e-7 if jnp.result_type(float) == jnp.float64 else 1e-3
+    return optx.LevenbergMarquardt(rtol=tolerance, atol=tolerance)
+
+
+def _controller(controller: Any) -> Any:
+    if controller is not None:
+        return controller
+    tolerance = 1e-8 if jnp.result_type(float) == jnp.float64 else 1e-5
+    return dfx.PIDController(rtol=tolerance, atol=tolerance)

@@ -1,0 +1,178 @@
+"""Residuals and losses of all pieces, and their derivatives."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jaxtyping import Array, Float
+
+from .._custom_types import FloatScalar
+from .model import Piece, Prediction, Simulator
+from .parameters import Transform
+
+
+class Objective(eqx.Module):
+    """Everything that the unknowns are compared with.
+
+    The unknowns are one vector: those of the `p` parameters, then `d` tangent coordinates for
+    each initial state in `free`. `joints` are the pieces that go on in the next one; their
+    gaps `c` enter as `stiffness (c + shift)`, an augmented Lagrangian.
+
+    `penalty` stands for every residual of a piece whose solve failed. It is a constant, larger
+    than any residual at the start: a step that makes solves fail is rejected, a trajectory that
+    fails all the time has no influence.
+    """
+
+    simulator: Simulator
+    transform: Transform
+    pieces: Piece
+    free: Any
+    joints: Any
+    stiffness: Any
+    shift: Any
+    penalty: Any
+    loss: Callable | None
+    unravel: Callable = eqx.field(static=True)
+    records: int = eqx.field(static=True)
+    reverse: bool = eqx.field(static=True)
+
+    def chosen(self, u: Float[Array, " N"], batch: Any = None) -> tuple[Any, Piece]:
+        """The unknowns of each piece, `(pieces, p + d)`, and the pieces: all, or some."""
+        p, d = self.transform.start.size, self.pieces.basis.shape[-1]
+        z = jnp.zeros((self.pieces.start.size, d), u.dtype)
+        z = z.at[self.free].set(u[p:].reshape(self.free.size, d))
+        x = jnp.concatenate([jnp.tile(u[:p], (z.shape[0], 1)), z], axis=1)
+        if batch is None:
+            return x, self.pieces
+        return jtu.tree_map(lambda leaf: leaf[batch], (x, self.pieces))
+
+
+class Solved(NamedTuple):
+    """Predictions of all pieces and their derivatives by the unknowns `(p + d,)` of each: as
+    many sweeps for one piece, however many unknowns there are in all."""
+
+    values: Prediction
+    matrices: Prediction | None
+
+    def around(self, u: Float[Array, " N"], objective: Objective, batch: Any = None) -> Prediction:
+        """The predictions as a function of `u` that can be differentiated (once)."""
+        x, _ = objective.chosen(u, batch)
+        step = x - jax.lax.stop_gradient(x)
+        return jtu.tree_map(
+            lambda v, M: v + jax.vmap(jnp.matmul)(M, step), self.values, self.matrices
+        )
+
+
+def solve(u: Float[Array, " N"], objective: Objective, batch: Any = None) -> Solved:
+    """Solve all pieces, or those of a batch. Failed ones give zeros, so that none of their
+    values gets into a derivative. No derivatives of many unknowns (`reverse`)."""
+    x, pieces = objective.chosen(jax.lax.stop_gradient(u), batch)
+    if objective.reverse:
+        return Solved(_backwards_all(objective, x, pieces), None)
+
+    def one(x: Any, piece: Piece) -> Solved:
+        def twice(x: Any) -> Any:
+            out = objective.simulator.predict(x, piece, objective.transform, dfx.ForwardMode())
+            return out, out
+
+        matrices, out = jax.jacfwd(twice, has_aux=True)(x)
+        finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(M)) for M in matrices]))
+        failed = (out.failed > 0) | ~finite
+        solved = jtu.tree_map(lambda leaf: jnp.where(failed, 0, leaf), Solved(out, matrices))
+        return eqx.tree_at(lambda s: s.values.failed, solved, failed.astype(x.dtype))
+
+    return jax.vmap(one)(x, pieces)
+
+
+def gaps(objective: Objective, predicted: Prediction) -> Float[Array, "joints d"]:
+    """From the end of a piece to the start of the next, along the manifold there."""
+    j = objective.joints
+    jump = predicted.end[j] - predicted.begin[j + 1]
+    gap = jnp.sum(objective.pieces.basis[j + 1] * jump[:, :, None], axis=1)
+    broken = (predicted.failed[j] + predicted.failed[j + 1]) > 0
+    return jnp.where(broken[:, None], 0, gap)
+
+
+def weighted(objective: Objective, predicted: Prediction) -> Float[Array, "pieces L k"]:
+    """Residuals in units of `sigma`."""
+    pieces = objective.pieces
+    r = pieces.weights * (predicted.observed - pieces.data)
+    penalty = jnp.where(pieces.weights > 0, objective.penalty, 0)
+    return jnp.where(predicted.failed[:, None, None] > 0, penalty, r)
+
+
+def residuals(u: Float[Array, " N"], objective: Objective) -> tuple[Any, Any]:
+    """For least-squares solvers: of the data and of the joints; then the loss and all pieces."""
+    solved = solve(u, objective)
+    predicted = solved.around(u, objective)
+    r = weighted(objective, predicted)
+    c = objective.stiffness * (gaps(objective, predicted) + objective.shift)
+    return (r, c), (0.5 * (jnp.sum(r * r) + jnp.sum(c * c)), solved)
+
+
+def total_loss(
+    u: Float[Array, " N"], objective: Objective, batch: Any = None
+) -> tuple[FloatScalar, Any]:
+    """For minimizers: the sum over all records, or the mean over those of a batch; then as above."""
+    x, pieces = objective.chosen(u, batch)
+    if objective.reverse:
+        predicted = _backwards_all(objective, x, pieces)
+        solved = Solved(predicted, None)
+    else:
+        solved = solve(u, objective, batch)
+        predicted = solved.around(u, objective, batch)
+    losses = jax.vmap(lambda *a: _own_loss(objective, *a))(
+        predicted.observed, pieces.data, pieces.weights
+    )
+    counts = jnp.sum(pieces.weights > 0, axis=(1, 2)).astype(losses.dtype)
+    bad = (predicted.failed > 0) | ~jnp.isfinite(losses)
+    losses = jnp.where(bad, 0.5 * objective.penalty**2 * counts, losses)
+    loss = jnp.sum(losses) if batch is None else jnp.mean(losses)
+    return loss, (loss, solved)
+
+
+def _own_loss(objective: Objective, observed: Any, data: Any, weights: Any) -> FloatScalar:
+    if objective.loss is None:
+        return 0.5 * jnp.sum(jnp.square(weights * (observed - data)))
+    loss = objective.loss(*(jax.vmap(objective.unravel)(a) for a in (observed, data, weights)))
+    if jnp.shape(loss) != ():
+        raise ValueError(
+            "`loss(prediction, data, weights)` must return one number for each record, got shape "
+            f"{jnp.shape(loss)}. Sum over times and components."
+        )
+    return loss
+
+
+def _backwards_all(objective: Objective, x: Any, pieces: Piece) -> Prediction:
+    rest = objective.simulator, objective.transform
+    return jax.vmap(lambda x, piece: _backwards(x, (piece, *rest)))(x, pieces)
+
+
+@eqx.filter_custom_vjp
+def _backwards(x: Any, rest: Any) -> Prediction:
+    """For many unknowns: one sweep backwards instead of one forwards for each."""
+    piece, simulator, transform = rest
+    return simulator.predict(x, piece, transform, dfx.RecursiveCheckpointAdjoint())
+
+
+@_backwards.def_fwd
+def _backwards_fwd(perturbed: Any, x: Any, rest: Any) -> Any:
+    del perturbed
+    piece, simulator, transform = rest
+    adjoint = dfx.RecursiveCheckpointAdjoint()
+    out, pullback = jax.vjp(lambda x: simulator.predict(x, piece, transform, adjoint), x)
+    return out, (pullback, out)
+
+
+@_backwards.def_bwd
+def _backwards_bwd(kept: Any, cotangent: Any, perturbed: Any, x: Any, rest: Any) -> Any:
+    """The zero cotangent of a failed solve would turn into NaN."""
+    del perturbed, x, rest
+    pullback, out = kept
+    given = zip(out, cotangent, strict=True)
+    (slope,) = pullback(Prediction(*(jnp.zeros_like(o) if c is None else c for o, c in given)))
+    return jnp.where(out.failed > 0, 0, slope)

@@ -1,0 +1,133 @@
+"""Records cut into pieces for multiple shooting, with a chart at the start of each."""
+
+import dataclasses
+from typing import Any
+
+import diffrax as dfx
+import jax
+import jax.flatten_util as jfu
+import jax.numpy as jnp
+import numpy as np
+
+from .._constraint import check_constraint, Invariants, jacobian, residual_vector
+from .data import filled_in_time, flatten, Records
+from .model import at_start, Piece, Simulator
+from .parameters import Transform
+
+
+def make_pieces(
+    records: Records,
+    segments: int,
+    simulator: Simulator,
+    transform: Transform,
+    states: Any,
+    free_start: bool,
+) -> Piece:
+    """Pieces of all records, those of one record next to each other.
+
+    A piece ends where the next one begins; what was measured there belongs to the next.
+    """
+    R, T = records.ts.shape
+    if not isinstance(segments, int) or not 1 <= segments < T:
+        raise ValueError(
+            f"`segments` must be a whole number from 1 to {T - 1} (the intervals of `ts`), "
+            f"got {segments!r}."
+        )
+    edges = edges_of(T, segments)
+    length = np.max(np.diff(edges)) + 1
+    index = np.minimum(edges[:-1, None] + np.arange(length), edges[1:, None])  # (S, L)
+    own = edges[:-1, None] + np.arange(length) < edges[1:, None]
+    own[-1] |= edges[-2] + np.arange(length) == T - 1
+    first = np.arange(segments) == 0
+    start = np.where(first, records.t0[:, None], records.ts[:, edges[:-1]])
+    weights = records.weights[:, index] * own[None, :, :, None]
+    guess = _guess(records, edges, simulator, transform, states)
+    basis = _charts(simulator, transform, start, guess, needed=free_start or segments > 1)
+    merge = lambda a: jnp.asarray(a.reshape(R * segments, *a.shape[2:]), float)
+    return Piece(
+        merge(start),
+        merge(records.ts[:, index]),
+        merge(records.data[:, index]),
+        merge(weights),
+        merge(guess),
+        merge(basis),
+        jnp.asarray(np.tile(first, R)),
+        jnp.asarray(np.repeat(np.arange(R), segments)),
+    )
+
+
+def edges_of(times: int, segments: int) -> np.ndarray:
+    """Indices of the times where pieces begin and end, `(segments + 1,)`."""
+    return np.round(np.linspace(0, times - 1, segments + 1)).astype(int)
+
+
+def _guess(
+    records: Records, edges: np.ndarray, simulator: Simulator, transform: Transform, states: Any
+) -> np.ndarray:
+    """States at the starts of all pieces, `(R, S, n)`: given, measured, or simulated."""
+    y0 = simulator.setting(transform.unravel(transform.start), 0).y0
+    first = _starts(records, simulator, transform)[:, None]
+    if edges.size == 2:
+        return np.asarray(first)
+    if states is not None:
+        lead = records.ts.shape if records.many else records.ts.shape[1:]
+        later = flatten(states, lead, y0, "states").reshape(*records.ts.shape, -1)
+        if not np.all(np.isfinite(later)):
+            raise ValueError("`states` must be finite: guesses of the states at all of `ts`.")
+    elif simulator.observe is None:
+        later = filled_in_time(records)
+    else:
+        later = _simulate(records, simulator, transform)
+    return np.concatenate([first, later[:, edges[1:-1]]], axis=1)
+
+
+def _starts(records: Records, simulator: Simulator, transform: Transform) -> Any:
+    parameters = transform.unravel(transform.start)
+    one = lambda r: jfu.ravel_pytree(simulator.setting(parameters, r).y0)[0]
+    return jax.vmap(one)(jnp.arange(records.ts.shape[0]))
+
+
+def _simulate(records: Records, simulator: Simulator, transform: Transform) -> np.ndarray:
+    """Trajectories with the start values of the parameters, for want of a better guess."""
+    whole, y0 = dataclasses.replace(simulator, observe=None), _starts(records, simulator, transform)
+    (R, T), n = records.ts.shape, y0.shape[1]
+    empty, first = jnp.zeros((R, T, 0)), jnp.ones(R, bool)
+    times = jnp.asarray(records.t0), jnp.asarray(records.ts)
+    pieces = Piece(*times, empty, empty, y0, jnp.zeros((R, n, 0)), first, jnp.arange(R))
+    u, adjoint = jnp.zeros_like(transform.start), dfx.ForwardMode()
+    predicted = jax.vmap(lambda piece: whole.predict(u, piece, transform, adjoint))(pieces)
+    if np.any(predicted.failed):
+        raise ValueError(
+            f"`parameters`: the solve of record {np.argmax(predicted.failed)} from the start values "
+            "fails, so that the states at the `segments` cannot be guessed. Pass them in `states`."
+        )
+    return np.asarray(predicted.observed)
+
+
+def _charts(
+    simulator: Simulator, transform: Transform, start: np.ndarray, guess: np.ndarray, needed: bool
+) -> np.ndarray:
+    """Orthonormal bases of the tangent spaces at all guesses, `(R, S, n, d)`.
+
+    `d` is the dimension of the manifold, of the whole space for conserved quantities, whose
+    values belong to the initial state. Without unknown states `d = 0`.
+    """
+    R, S, n = guess.shape
+    parameters = transform.unravel(transform.start)
+    setting = simulator.setting(parameters, 0)
+    check_constraint(setting.constraint, start[0, 0], setting.y0, setting.args)
+    if not needed:
+        return np.zeros((R, S, n, 0))
+    if isinstance(setting.constraint, Invariants):
+        return np.broadcast_to(np.eye(n), (R, S, n, n))
+    unravel = jfu.ravel_pytree(setting.y0)[1]
+
+    def rows(t: Any, x: Any) -> Any:
+        constraint = at_start(setting.constraint, t, unravel(x), setting.args)
+        g = lambda x: residual_vector(constraint, t, unravel(x), setting.args)
+        return jacobian(g, x)[1]
+
+    G = np.asarray(jax.vmap(jax.vmap(rows))(jnp.asarray(start), jnp.asarray(guess)))
+    _, s, Vt = np.linalg.svd(G)
+    rank = int(np.max(np.sum(s > 1e-8 * s[..., :1], axis=-1)))
+    return np.swapaxes(Vt[..., rank:, :], -1, -2)

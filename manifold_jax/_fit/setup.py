@@ -1,0 +1,128 @@
+"""The start of a fit: options checked, everything put together and scaled."""
+
+from typing import Any
+
+import equinox as eqx
+import jax.flatten_util as jfu
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+import optax
+import optimistix as optx
+
+from .data import Records
+from .model import Simulator
+from .objective import Objective, Solved, weighted
+from .optimize import Options
+from .parameters import Transform
+
+
+def check_initial(simulator: Simulator, transform: Transform, grid: tuple[int, ...]) -> None:
+    y0 = simulator.y0
+    y0 = y0(transform.unravel(transform.start)) if callable(y0) else y0
+    if y0 is None or not simulator.many:
+        return
+    for leaf in jtu.tree_leaves(y0):
+        if np.shape(leaf)[:1] != grid[:1]:
+            raise ValueError(
+                f"`y0` must have a leading axis of {grid[0]} records as `ts` has, got a leaf of shape "
+                f"{np.shape(leaf)}."
+            )
+
+
+def check_options(
+    options: Options, optimizer: Any, loss: Any, segments: Any, records: Records
+) -> None:
+    by_gradient = isinstance(optimizer, optax.GradientTransformation)
+    squares = isinstance(optimizer, optx.AbstractLeastSquaresSolver)
+    if not by_gradient and not squares and not isinstance(optimizer, optx.AbstractMinimiser):
+        raise TypeError(
+            "`optimizer` must be an Optimistix least-squares solver or minimizer, or an Optax "
+            f"optimizer such as `optax.adam(1e-2)`, got {type(optimizer).__name__}."
+        )
+    if loss is not None and squares:
+        raise ValueError(
+            "`loss` is no sum of squares that a least-squares solver could use. Write "
+            "`optimizer=optx.BFGS(rtol=1e-6, atol=1e-6)` or an Optax optimizer."
+        )
+    if segments != 1 and not squares:
+        raise ValueError(
+            "`segments` (multiple shooting) needs a least-squares optimizer and no `loss`."
+        )
+    for name in ("steps", "patience"):
+        value = getattr(options, name)
+        if not isinstance(value, int) or value < 1:
+            raise ValueError(f"`{name}` must be a positive whole number, got {value!r}.")
+    size, count = options.batch_size, records.ts.shape[0]
+    if size is None:
+        return
+    if not by_gradient:
+        raise ValueError("`batch_size` needs an Optax optimizer: `optimizer=optax.adam(1e-2)`.")
+    if not isinstance(size, int) or not 1 <= size <= count:
+        raise ValueError(
+            f"`batch_size` must be a whole number from 1 to {count}, the number of records (an "
+            f"empty batch has nothing to fit), got {size!r}."
+        )
+
+
+def check_amount(unknowns: int, objective: Objective) -> None:
+    """Equations at the joints determine as many unknowns as the states there are."""
+    joints = objective.joints.size * objective.pieces.basis.shape[-1]
+    values = int(jnp.sum(objective.pieces.weights > 0))
+    if values < unknowns - joints:
+        raise ValueError(
+            f"`data` has {values} observed values for {unknowns - joints} unknowns. Fit fewer "
+            "`parameters`, or measure more."
+        )
+
+
+def make_objective(
+    simulator: Any,
+    transform: Transform,
+    pieces: Any,
+    records: Records,
+    fit_initial: bool,
+    loss: Any,
+    seen: Any,
+    reverse: bool,
+) -> Objective:
+    first = np.asarray(pieces.first)
+    free = np.flatnonzero(~first | fit_initial)
+    joints = np.flatnonzero(~np.roll(first, -1))
+    # A gap counts as much as a residual of the same relative size.
+    known = records.weights[records.weights > 0]
+    size = np.sqrt(np.mean(records.data[records.weights > 0] ** 2))
+    states = np.sqrt(np.mean(np.asarray(pieces.guess) ** 2))
+    stiffness = np.sqrt(np.mean(known**2)) * size / states if states > 0 else 1.0
+    zeros = jtu.tree_map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), seen)
+    dtype = transform.start.dtype
+    return Objective(
+        simulator,
+        transform,
+        pieces,
+        jnp.asarray(free),
+        jnp.asarray(joints),
+        jnp.asarray(stiffness, dtype),
+        jnp.zeros((joints.size, pieces.basis.shape[-1]), dtype),
+        jnp.ones((), dtype),
+        loss,
+        jfu.ravel_pytree(zeros)[1],
+        records.ts.shape[0],
+        reverse,
+    )
+
+
+def with_scales(objective: Objective, solved: Solved) -> Objective:
+    """A failed solve counts ten times the largest residual at the start."""
+    failed = np.asarray(solved.values.failed) > 0
+    if np.all(failed):
+        raise ValueError(
+            "`parameters`: every solve from the start values fails (or its derivatives are not "
+            "finite), so that there is nothing to improve. Check them with `mj.diffeqsolve`, "
+            "start elsewhere, or raise `max_steps`."
+        )
+    r = np.asarray(weighted(objective, solved.values))
+    largest = np.max(np.abs(r[~failed]), initial=1.0)
+    data = np.max(np.abs(np.asarray(objective.pieces.weights * objective.pieces.data)))
+    penalty = jnp.asarray(10 * max(largest, data), objective.penalty.dtype)
+    return eqx.tree_at(lambda o: o.penalty, objective, penalty)

@@ -1,0 +1,140 @@
+"""Systems with known parameters, and measurements simulated from them, for the tests of `fit`."""
+
+from typing import Any, NamedTuple
+
+import diffrax as dfx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import manifold_jax as mj
+
+
+class Case(NamedTuple):
+    """What `mj.fit` needs; `sigma` like the data, `truth` like the parameters."""
+
+    model: Any
+    truth: Any
+    ts: np.ndarray
+    sigma: Any
+    options: dict
+
+
+def _weight(t, q, v, args):
+    return jnp.stack([jnp.zeros_like(args["gravity"]), -args["gravity"]]) - args["damping"] * v
+
+
+def _hanging(args):
+    return args["length"] * jnp.array([0.8, -0.6]), jnp.zeros(2)
+
+
+def damped_pendulum():
+    """Unit mass; the length is in the constraint and in the initial state."""
+    rod = lambda t, q, args: q @ q - args["length"] ** 2
+    system = mj.MechanicalSystem(1.0, rod, _weight)
+    truth = {"gravity": 9.81, "length": 1.0, "damping": 0.3}
+    options = dict(y0=_hanging, positive=True)
+    return Case(system, truth, np.linspace(0, 2.5, 51), (0.01, 0.05), options)
+
+
+def _rods(t, q, args):
+    return (
+        jnp.sum(jnp.diff(q, axis=0, prepend=jnp.zeros((1, 2))) ** 2, axis=1) - args["lengths"] ** 2
+    )
+
+
+def _masses(q, args):
+    return jnp.repeat(args["masses"], 2)
+
+
+def _pushed(t, q, v, args):
+    """Motion without a known force has no scale of mass."""
+    push = jnp.stack([3 * jnp.cos(2 * t), 0 * t])
+    weight = -9.81 * args["masses"][:, None] * jnp.array([[0.0, 1.0]])
+    return weight + jnp.array([[0.0], [1.0]]) * push[None, :]
+
+
+def _bent(args):
+    angle = jnp.array([np.pi / 4, -np.pi / 4])
+    links = args["lengths"][:, None] * jnp.stack([jnp.sin(angle), -jnp.cos(angle)], axis=1)
+    return jnp.cumsum(links, axis=0), jnp.zeros((2, 2))
+
+
+def pushed_double_pendulum():
+    system = mj.MechanicalSystem(_masses, _rods, _pushed)
+    truth = {"masses": np.array([1.0, 0.8]), "lengths": np.array([1.0, 0.7])}
+    options = dict(y0=_bent, positive=True)
+    return Case(system, truth, np.linspace(0, 2, 41), (0.01, 0.05), options)
+
+
+def _body(ratios):
+    """Moments of inertia `1, r, s`, started with known angular velocities."""
+    inertia = jnp.stack([jnp.ones_like(ratios["r"]), ratios["r"], ratios["s"]])
+    problem = mj.problems.rigid_body(inertia=inertia)
+    return problem.with_initial(inertia * jnp.array([0.5, 0.3, 1.2]))
+
+
+def _gyroscope(t, y, ratios):
+    return y / jnp.stack([jnp.ones_like(ratios["r"]), ratios["r"], ratios["s"]])
+
+
+def rigid_body():
+    options = dict(observe=_gyroscope, positive=True)
+    return Case(_body, {"r": 0.6, "s": 0.4}, np.linspace(0, 10, 51), 0.01, options)
+
+
+def slider_crank():
+    truth = {"stiffness": 1.0, "damping": 1.0}
+    return Case(
+        mj.problems.slider_crank(), truth, np.linspace(0, 10, 51), 0.02, dict(positive=True)
+    )
+
+
+ALL = {
+    "pendulum": damped_pendulum,
+    "double-pendulum": pushed_double_pendulum,
+    "rigid-body": rigid_body,
+    "slider-crank": slider_crank,
+}
+
+
+def exact_data(case):
+    """Far more accurate than the fits are: another method, at 1e-12."""
+    parameters = jax.tree.map(lambda leaf: jnp.asarray(leaf, float), case.truth)
+    built = case.model
+    if not isinstance(built, mj.MechanicalSystem):
+        built = (
+            built(parameters)
+            if callable(built)
+            else built.with_args(built.args._replace(**parameters))
+        )
+    y0 = case.options["y0"](parameters) if "y0" in case.options else built.y0
+    sol = mj.diffeqsolve(
+        built.terms,
+        mj.Projected(dfx.Dopri8(), built.constraint),
+        case.ts[0],
+        case.ts[-1],
+        None,
+        y0,
+        parameters if isinstance(built, mj.MechanicalSystem) else built.args,
+        saveat=dfx.SaveAt(ts=jnp.asarray(case.ts)),
+        stepsize_controller=dfx.PIDController(rtol=1e-12, atol=1e-12),
+        max_steps=100000,
+    )
+    observe = case.options.get("observe", lambda t, y, p: y)
+    return jax.tree.map(
+        np.asarray, jax.vmap(lambda t, y: observe(t, y, parameters))(sol.ts, sol.ys)
+    )
+
+
+def with_noise(case, data, rng):
+    sigma = (
+        case.sigma if isinstance(case.sigma, tuple) else jax.tree.map(lambda _: case.sigma, data)
+    )
+    return jax.tree.map(lambda d, s: d + s * rng.normal(size=d.shape), data, sigma)
+
+
+def start_off(case, rng, amount=0.3):
+    """Every number wrong by `amount`, up or down."""
+    off = lambda leaf: leaf * (1 + amount * rng.choice([-1.0, 1.0], size=np.shape(leaf)))
+    return jax.tree.map(off, case.truth)
