@@ -1,0 +1,53 @@
+"""The notebooks run from top to bottom, and are kept with what they show."""
+
+from pathlib import Path
+
+import nbclient
+import nbformat
+import pytest
+
+
+NOTEBOOKS = sorted(Path(__file__).parents[1].glob("notebooks/*.ipynb"))
+
+notebooks = pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+
+
+def test_there_are_notebooks():
+    assert NOTEBOOKS
+
+
+@notebooks
+def test_is_short_and_saved_with_its_output(path):
+    notebook = nbformat.read(path, as_version=4)
+    nbformat.validate(notebook)
+    assert path.stat().st_size < 200_000
+    assert 6 <= len(notebook.cells) <= 12
+    first, *_, last = notebook.cells
+    assert first.cell_type == "markdown"
+    assert first.source.startswith("# ")
+    assert last.cell_type == "markdown"
+    assert "**What to remember:**" in last.source
+
+    code = [cell for cell in notebook.cells if cell.cell_type == "code"]
+    assert [cell.execution_count for cell in code] == list(range(1, len(code) + 1))
+    assert "jax_enable_x64" in code[0].source
+    outputs = [output for cell in code for output in cell.outputs]
+    assert {output.output_type for output in outputs} <= {"stream", "display_data"}
+    assert all(output.name == "stdout" for output in outputs if output.output_type == "stream")
+    assert any("image/png" in output.get("data", {}) for output in outputs)
+
+
+@pytest.mark.slow
+@notebooks
+def test_runs_in_a_fresh_kernel(path, tmp_path, monkeypatch):
+    # As a reader runs it, not with the flags of the tests: code compiled without
+    # optimization is too slow for ten thousand pendulums.
+    monkeypatch.delenv("XLA_FLAGS", raising=False)
+    notebook = nbformat.read(path, as_version=4)
+    client = nbclient.NotebookClient(
+        notebook, timeout=300, kernel_name="python3", resources={"metadata": {"path": tmp_path}}
+    )
+    client.execute()
+    outputs = [output for cell in notebook.cells for output in cell.get("outputs", [])]
+    assert any("image/png" in output.get("data", {}) for output in outputs)
+    assert not [output.text for output in outputs if output.get("name") == "stderr"]
