@@ -53,7 +53,10 @@ class MechanicalSystem(eqx.Module):
         [`Projected`][] or [`LocalCoordinates`][].
     - `redundant`: constraints may depend on each other (closed loops described twice). The
         accelerations are those of the independent ones, the multipliers the ones of least
-        norm. Otherwise dependent constraints give an error at the start.
+        norm. Otherwise dependent constraints give an error at the start. What counts as
+        dependent is decided anew in every evaluation, also beside the manifold: directions in
+        which the equations are a hundred times weaker than in the strongest. Write equations
+        in like units, and keep tolerances below about 1e-3.
 
     Where the accelerations are not defined (a mass matrix that is not positive definite or not
     symmetric, dependent constraints) they are NaN: steps that meet them are rejected and the
@@ -80,7 +83,7 @@ class MechanicalSystem(eqx.Module):
         redundant: bool = False,
     ):
         _check_arguments(constraint, force, velocity_constraint, stabilization)
-        own = isinstance(mass_matrix, LagrangianMass)
+        own = isinstance(mass_matrix, LagrangianMass | ConfigurationMass)  # of another system
         self.mass_matrix = mass_matrix if own else ConfigurationMass(mass_matrix)
         self.holonomic = constraint
         self.nonholonomic = velocity_constraint
