@@ -33,7 +33,20 @@ def build(name):
     )
 
 
-@pytest.mark.parametrize("name", [*mj.problems.ALL, "outside"])
+# Long to compile.
+MECHANISMS = {
+    *("four-bar", "heavy-top", "parallelogram", "double-pendulum", "chain", "slider-crank"),
+    *("rolling-disc", "spherical-pendulum", "rotation"),
+}
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=pytest.mark.slow) if name in MECHANISMS else name
+        for name in [*mj.problems.ALL, "outside"]
+    ],
+)
 def test_gallery_in_single_precision(name):
     terms, constraint, (t0, t1, y0, args) = build(name)
 

@@ -262,6 +262,7 @@ def tension_of(gravity, **options):
     return 2 * multipliers * jnp.linalg.norm(sol.ys[0], axis=1), sol.ys[0]
 
 
+@pytest.mark.slow
 def test_constraint_force_is_the_tension_of_the_string():
     tension, _ = tension_of(GRAVITY)
     # energy: |v|^2 = -2 g y; tension = |v|^2 - g y = -3 g y, from the exact solution
@@ -299,6 +300,7 @@ def crank(angle, length, gravity):
     return (q, jnp.zeros(3)), {"length": length, "gravity": gravity}
 
 
+@pytest.mark.slow
 def test_redundant_constraints():
     """Accelerations, trajectories and gradients of the reduced mechanism, in a batch."""
     redundant, reduced = parallelogram(True), parallelogram(False, third_crank=False)
