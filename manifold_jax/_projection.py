@@ -72,7 +72,9 @@ class NewtonProjection(eqx.Module):
         lowers the residual; states are then near the manifold (the square of the local error),
         not on it to round-off.
     - `tolerance`: the largest scaled residual that counts as success. `None` is 50
-        rounding units of the state's type.
+        rounding units of the state's type. Where a residual has larger rounding errors than
+        that (large terms that cancel) corrections fail: write it without cancellation, or
+        raise the tolerance.
     - `rtol`, `atol`: the tolerances of the step size controller; `mj.diffeqsolve` fills
         them in. With them, `Projected` raises the error estimate of a step where the
         correction is larger: the correction is a lower bound of the local error.

@@ -173,7 +173,8 @@ class _Backwards(eqx.Module):
             keep = lambda a, b: jnp.where(live, a, b)
             return jtu.tree_map(keep, y1, y), y
 
-        start = jtu.tree_map(lambda y: y[i], record.states)
+        unfinished = first < self.num_steps
+        start = jtu.tree_map(lambda y: jnp.where(unfinished, y[i], y[0]), record.states)
         _, states = lax.scan(advance, start, (starts, ends, live))
         return _Block(first, starts, ends, states)
 
