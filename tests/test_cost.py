@@ -60,5 +60,5 @@ def test_projection_costs_no_field_and_one_jacobian_per_step(solver, stages):
     assert plain["field"] in (stages * stats["num_steps"] + np.arange(first, 2 * first + 1))
     assert projected["field"] == stages * attempted + first
     assert projected["jacobian"] == attempted
-    np.testing.assert_array_less(2 * attempted - 1, projected["residual"])
-    np.testing.assert_array_less(projected["residual"], 4 * attempted)
+    # at least twice: before, and after an iteration; twenty iterations are the limit
+    assert 2 * attempted <= projected["residual"] <= 21 * attempted
