@@ -66,6 +66,9 @@ def diffeqsolve(
         refuses it if it is not there (to `tolerance`), `"assume"` trusts it.
     - `event`: event functions get the true time, also when integrating backwards.
 
+    Python numbers among the arguments (`t1`, tolerances) are part of the compiled program; pass
+    `jnp.asarray(...)` to solve with other values without compiling again.
+
     **Returns:**
 
     A `diffrax.Solution`; `sol.stats` has in addition
