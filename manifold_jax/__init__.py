@@ -41,6 +41,7 @@ from ._stabilization import (
     ExactStabilization as ExactStabilization,
     InvariantStabilization as InvariantStabilization,
 )
+from ._tangent import tangent_field as tangent_field
 
 
 __version__ = version("manifold_jax")

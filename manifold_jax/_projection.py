@@ -179,7 +179,7 @@ class NewtonProjection(eqx.Module):
         q, v = equations.flat(y)
         C, _ = equations.rows(t, q, v, args)
         if inverse_metric is not None:
-            return C, C * jnp.split(inverse_metric, 2)[1]
+            return C, C * jnp.split(inverse_metric, 2)[1][None, :]
         if self.metric == "identity":
             return C, C
         return C, equations.mass(t, q, v, args, C).solve(C)
@@ -187,7 +187,7 @@ class NewtonProjection(eqx.Module):
     def weighted(self, G: Float[Array, "m n"], y: Y) -> Float[Array, "m n"]:
         """`G W^-1`; the identity instead of a mass matrix."""
         inverse_metric = self._inverse_metric(y, jfu.ravel_pytree(y)[0])
-        return G if inverse_metric is None else G * inverse_metric
+        return G if inverse_metric is None else G * inverse_metric[None, :]
 
     def tolerance_for(self, dtype: Any) -> RealScalarLike:
         """The largest scaled residual that counts as success."""

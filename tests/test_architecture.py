@@ -22,7 +22,7 @@ LAYERS = [
     {"_two_stage"},
     {"_projection"},
     {"_chart", "_stabilization"},
-    {"_interpolation", "_initial"},
+    {"_tangent", "_interpolation", "_initial"},
     {"_solver"},
     {"_adjoint"},
     {"_output"},

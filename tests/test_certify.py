@@ -39,6 +39,17 @@ def test_a_wrong_gradient_is_not_certified():
     assert not is_certified(Combination("projected", "Tsit5", failure="the solve failed"))
 
 
+def test_only_what_must_be_refused_may_be():
+    good = Check("forward", 0.0, 0.0, 0.0)
+    backsolve = Check("backsolve", refused="it would be wrong")
+    case = lambda *checks: Combination("projected", "Tsit5", differences=0.0, checks=checks)
+    assert is_certified(case(good, backsolve))
+    assert not is_certified(case(good, Check("replay", refused="a mistake")))
+    assert not is_certified(case(good, Check("backsolve", 0.0, 0.0, 0.0)))
+    assert is_certified(case(good, Check("checkpointed", 0.0, None, 0.0)))
+    assert not is_certified(case(good, Check("replay", 0.0, None, 0.0)))
+
+
 def test_parameters_reach_constraint_and_start():
     """The pendulum's length is in all three; without one of them the gradient is another."""
     approach = next(a for a in APPROACHES if a.name == "projected")
@@ -60,7 +71,8 @@ def test_arguments():
 def test_command(tmp_path):
     """A conserved quantity as constraint, and the parameters in it."""
     file = tmp_path / "certificate.json"
-    options = "--t1 3 --methods tangent --adjoints forward,replay,backsolve --json".split()
+    options = "--t1 3 --methods tangent --adjoints forward,checkpointed,replay,backsolve".split()
+    options.append("--json")
     result = run("rigid-body", *options, str(file))
     assert result.exit_code == 0, result.output
     (row,) = json.loads(file.read_text())["rows"]
@@ -68,4 +80,6 @@ def test_command(tmp_path):
     assert row["tangency"] < 1e-12
     ways = {check["adjoint"]: check for check in row["checks"]}
     assert "BacksolveAdjoint" in ways["backsolve"]["refused"]
+    assert ways["checkpointed"]["hessian"] is None  # refused by Diffrax
+    assert ways["replay"]["hessian"] < 1e-10
     assert ways["replay"]["difference"] < 1e-12

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._compare.approaches import Approach
+from .._solver.base import AbstractManifoldSolver
 from ..problems import Problem
 
 
@@ -66,6 +67,12 @@ class Case:
     def theta(self) -> Float[Array, " parameters"]:
         parameters = self.problem.y0 if self.problem.args is None else self.problem.args
         return jfu.ravel_pytree(parameters)[0]
+
+    @property
+    def is_corrected(self) -> bool:
+        """Whether the approach has a hook of this library around the solver."""
+        formulation = self.approach.formulate(self.problem, self.solver, self.gain)
+        return isinstance(formulation.solver, AbstractManifoldSolver)
 
     def problem_at(self, theta: Float[Array, " parameters"]) -> Problem:
         if self.problem.args is None:

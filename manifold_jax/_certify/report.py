@@ -8,10 +8,10 @@ from typing import Any
 
 from rich.table import Table
 
-from .checks import Check, Combination
+from .checks import Check, Combination, ONCE, REFUSED
 
 
-# What a correct gradient satisfies, as printed below the table.
+# What a correct gradient satisfies.
 REVERSE_BOUND, DIFFERENCES_BOUND = 1e-10, 1e-7
 
 
@@ -42,7 +42,7 @@ def _cells(check: Check) -> list[str]:
     return [
         check.adjoint,
         _number(check.difference, ".1e"),
-        _number(check.hessian, ".1e"),
+        "refused" if check.hessian is None else f"{check.hessian:.1e}",
         _number(check.batch, ".1e"),
         _number(check.run_ms, ".2f"),
         _number(check.compile_s, ".1f"),
@@ -55,16 +55,19 @@ def _number(value: float | None, form: str) -> str:
 
 
 def is_certified(combination: Combination) -> bool:
-    """Whether all gradients agree as well as they should."""
-    found = [c.difference for c in combination.checks if c.difference is not None]
-    found += [c.batch for c in combination.checks if c.batch is not None]
-    found += [c.hessian for c in combination.checks if c.hessian is not None]
-    agree = all(value <= REVERSE_BOUND for value in found)
-    return (
-        agree
-        and combination.differences is not None
-        and (combination.differences <= DIFFERENCES_BOUND)
-    )
+    """Whether all gradients agree as well as they should, and only that is refused which has
+    to be."""
+    if combination.failure is not None or combination.differences is None:
+        return False
+    return combination.differences <= DIFFERENCES_BOUND and all(map(_agrees, combination.checks))
+
+
+def _agrees(check: Check) -> bool:
+    if check.adjoint == REFUSED or check.refused is not None:
+        return check.adjoint == REFUSED and check.refused is not None
+    hessian = 0.0 if check.adjoint == ONCE and check.hessian is None else check.hessian
+    values = (check.difference, check.batch, hessian)
+    return all(value is not None and value <= REVERSE_BOUND for value in values)
 
 
 def write_json(path: Path, settings: dict[str, Any], combinations: Sequence[Combination]) -> None:

@@ -43,6 +43,10 @@ class Projected(AbstractManifoldSolver):
     Projection guarantees the constraint, not a smaller error: usually the error shrinks,
     sometimes it grows (compare with `manifold-jax compare`).
 
+    The vector field has to be tangent to the manifold where it is evaluated, up to the tolerance;
+    the corrections are as small as the errors of the solver then. Make others so with
+    [`tangent_field`][] (neural networks, simplified models).
+
     Source: Sudarsan & Keerthi (1998), section 3.4; Shampine, Comp. Math. Appl. 12B (1986)
     1287-1296; Eich, SIAM J. Numer. Anal. 30 (1993) 1467-1482.
     """

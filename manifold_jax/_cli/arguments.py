@@ -1,0 +1,86 @@
+"""What was asked for on the command line, or an error that says what could have been."""
+
+import math
+from collections.abc import Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import typer
+
+
+if TYPE_CHECKING:
+    from .._compare.methods import Method
+    from .._compare.task import Task
+
+
+# What matplotlib writes without further programs.
+FIGURE_TYPES = (".png", ".pdf", ".svg", ".jpg")
+
+
+def task_for(
+    problem: str, solver: str, rtol: float, atol: float, t1: float | None, gain: float | None
+) -> "Task":
+    """The task asked for, or an error that says what could have been asked for."""
+    from .._compare.approaches import default_gain
+    from .._compare.task import Task
+    from .._compare.with_diffrax import SOLVERS
+    from ..problems import ALL
+
+    problem, solver = problem.lower().replace("_", "-"), solver.lower()
+    check_name(problem, ALL, "problem", "PROBLEM")
+    check_name(solver, SOLVERS, "solver", "--solver")
+    built = ALL[problem]()
+    gain = default_gain(built) if gain is None else gain
+    for name, value in (("--rtol", rtol), ("--atol", atol), ("--gain", gain)):
+        if not (math.isfinite(value) and value > 0):
+            raise typer.BadParameter(f"must be a positive number, got {value}.", param_hint=name)
+    t1 = built.t1 if t1 is None else t1
+    if not (math.isfinite(t1) and t1 > built.t0):
+        raise typer.BadParameter(
+            f"must be later than the start of `{problem}`, t0 = {built.t0:g}; got {t1}.",
+            param_hint="--t1",
+        )
+    return Task(built, solver, rtol, atol, t1, gain)
+
+
+def choose(names: str | None, task: "Task") -> tuple[list["Method"], list["Method"]]:
+    """Of the methods asked for, those that can solve the task, and those that cannot."""
+    from .._compare.methods import METHODS
+
+    known = [method.key for method in METHODS]
+    asked = known if names is None else names_in(names, known, "method", "--methods")
+    methods = [method for method in METHODS if method.key in asked]
+    chosen = [method for method in methods if method.applies_to(task)]
+    if not chosen:
+        raise typer.BadParameter(
+            f"{', '.join(asked)} needs a mechanical system, which `{task.problem.name}` is not.",
+            param_hint="--methods",
+        )
+    return chosen, [method for method in methods if method not in chosen]
+
+
+def names_in(text: str, known: Iterable[str], kind: str, hint: str) -> list[str]:
+    """A list separated by commas, all of known names."""
+    names = [name.strip().lower() for name in text.split(",")]
+    for name in names:
+        check_name(name, known, kind, hint)
+    return names
+
+
+def check_name(name: str, known: Iterable[str], kind: str, hint: str) -> None:
+    if name not in known:
+        raise typer.BadParameter(
+            f"there is no {kind} {name!r}. Choose one of: {', '.join(known)}.", param_hint=hint
+        )
+
+
+def check_target(path: Path | None, option: str, suffixes: tuple[str, ...] | None) -> None:
+    """Say so before the computation if its result could not be written."""
+    if path is None:
+        return
+    if path.is_dir() or not path.parent.is_dir():
+        raise typer.BadParameter(f"cannot write the file {str(path)!r}.", param_hint=option)
+    if suffixes is not None and path.suffix.lower() not in suffixes:
+        raise typer.BadParameter(
+            f"{str(path)!r} must end in one of: {', '.join(suffixes)}.", param_hint=option
+        )
