@@ -5,6 +5,8 @@ mechanism and cannot be fused across a batch. Up to `UNROLL_LIMIT` rows the elim
 is therefore written out entry by entry; beyond that the library routine is used.
 """
 
+import functools
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -108,10 +110,20 @@ def _factorize_with_library(A: Float[Array, "m m"], threshold: float) -> Factori
 
 
 def gram(A: Float[Array, "i n"], B: Float[Array, "k n"]) -> Float[Array, "i k"]:
-    """`A B^T`; small ones as a sum that fuses, as batched tiny `dot`s are slow."""
+    """`A B^T`; small ones written out, as tiny `dot`s and reductions in a batch are slow: XLA
+    makes calls of a library of them, which cannot be fused with what is around."""
     if max(A.shape[0], B.shape[0]) > UNROLL_LIMIT:
         return A @ B.T
-    return jnp.sum(A[:, None, :] * B[None, :, :], axis=2)
+    if A.shape[1] > UNROLL_LIMIT:
+        return jnp.sum(A[:, None, :] * B[None, :, :], axis=2)
+    return sum(A[:, None, j] * B[None, :, j] for j in range(A.shape[1]))
+
+
+def largest(x: Float[Array, "*rows n"]) -> Float[Array, "*rows"]:
+    """The maximum of each row."""
+    if x.shape[-1] > UNROLL_LIMIT:
+        return jnp.max(x, axis=-1)
+    return functools.reduce(jnp.maximum, [x[..., j] for j in range(x.shape[-1])])
 
 
 def combine(weights: Float[Array, " m"], rows: Float[Array, "m n"]) -> Float[Array, " n"]:
