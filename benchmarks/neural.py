@@ -206,6 +206,9 @@ def main(
         for approach in APPROACHES:
             with console.status(f"{name}, {approach}"):
                 row, curve = measure(SYSTEMS[name], approach, steps, seed)
+            console.print(
+                f"{name}, {approach}: {row.training_s:.0f} s, state error {row.error:.2g}"
+            )
             rows.append(row)
             curves.append(curve)
     console.print(result_table(rows))

@@ -110,6 +110,15 @@ def tumbling_longer():
     return problem, constraint, 4 * end
 
 
+def tumbling_elsewhere():
+    """From a start where the leading error term of the eighth-order method dominates soon: on
+    others, closer to the middle axis, a slope up to 10 is seen for charts in this range."""
+    problem = mj.problems.rigid_body()
+    start = np.array([0.2, -0.2, 0.96])
+    problem = problem.with_initial(jnp.asarray(start / np.linalg.norm(start)))
+    return problem, mj.Constraint(lambda t, y, args: y @ y - 1.0), 30.0
+
+
 def swinging():
     """Within 37 degrees, where a coordinate partition need not change."""
     problem = mj.problems.pendulum(q0=(0.6, -0.8))
@@ -131,12 +140,10 @@ COUNTS = {
     ("Dopri5", tumbling_longer): [1000, 1200, 1400, 1600, 2000],
     ("Dopri5", swinging): [384, 512, 640, 768, 1024],
     ("Dopri5", two_rods): [128, 192, 256, 384],
-    ("Dopri8", tumbling): [24, 28, 32, 40, 48, 56, 64],
+    ("Dopri8", tumbling_elsewhere): [28, 32, 40, 48, 56, 64, 80, 96],
     ("Dopri8", swinging): [24, 32, 40, 48, 56, 64, 80],
     ("Dopri8", two_rods): [32, 40, 48, 56, 64],
 }
-# Charts converge faster than they have to there: measured 9.65 (tangent), 9.34 (partition).
-FASTER = {("Dopri8", tumbling, "tangent"), ("Dopri8", tumbling, "partition")}
 # One solver for every approach by default, the rest in the slow part.
 CASES = [
     pytest.param(
@@ -192,7 +199,4 @@ def test_order_of_every_approach(name, make, hook):
     errors = largest_errors(solver, counts, *make(), HOOKS[hook])
     slope = slope_of(counts, errors)
     print(f"{name:9s} {make.__name__:10s} {hook:10s} slope {slope:.3f}  errors {errors}")
-    if (name, make, hook) in FASTER:
-        assert 7.5 <= slope <= 10
-    else:
-        check(name, slope, order)
+    check(name, slope, order)

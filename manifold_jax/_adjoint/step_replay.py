@@ -54,8 +54,9 @@ class StepReplayAdjoint(dfx.AbstractAdjoint):
     `ts` and `steps` in one `SubSaveAt`. An error when differentiating with respect to times
     (`t0`, `t1`, `dt0`, `ts`) or through the dense solution. Use
     `diffrax.RecursiveCheckpointAdjoint()` there, which is also the better choice where a
-    state is so large that `max_steps` of them do not fit into memory; for few parameters and
-    many outputs use `diffrax.ForwardMode()`.
+    state is so large that `max_steps` of them do not fit into memory, and under `vmap` with
+    thousands of parameters in common (neural networks: each trajectory sums up a gradient
+    of its own); for few parameters and many outputs use `diffrax.ForwardMode()`.
 
     Source: Griewank & Walther, Evaluating Derivatives (2008), ch. 12, without recursion.
     """
