@@ -209,16 +209,18 @@ def loops(jaxpr):
 
 
 @pytest.mark.slow
-def test_hessian_vector_product():
+@pytest.mark.parametrize("hook", [mj.Projected, None], ids=["projected", "plain"])
+@pytest.mark.parametrize("solver", [dfx.Tsit5(), dfx.Kvaerno3()], ids=["Tsit5", "Kvaerno3"])
+def test_hessian_vector_product(hook, solver):
     """Forward over the replay: the loops back are differentiable forwards."""
-    case = (mj.Projected, SAVEATS["t1"], dfx.Tsit5())
+    case = (hook, SAVEATS["t1"], solver)
     direction = jnp.array([0.3, -0.2, 0.5])
 
     def along(gradient):
         return jax.jit(lambda theta: jax.jvp(gradient, (theta,), (direction,))[1])(THETA)
 
-    replayed = along(jax.grad(lambda theta: loss(theta, mj.StepReplayAdjoint(), *case)))
-    forward = along(jax.jacfwd(lambda theta: loss(theta, dfx.ForwardMode(), *case)))
+    replayed = along(jax.grad(lambda theta: loss(theta, mj.StepReplayAdjoint(), *case, t1=0.5)))
+    forward = along(jax.jacfwd(lambda theta: loss(theta, dfx.ForwardMode(), *case, t1=0.5)))
     np.testing.assert_allclose(replayed, forward, rtol=1e-10)
 
 

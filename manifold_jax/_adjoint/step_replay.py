@@ -90,6 +90,7 @@ class StepReplayAdjoint(dfx.AbstractAdjoint):
     ) -> Any:
         del throw, passed_solver_state, passed_controller_state
         _check_supported(terms, saveat, event, max_steps)
+        solver = _twice_differentiable(solver)
         fixed = (t0, t1, dt0, stepsize_controller, init_state.tprev, init_state.tnext)
         t0, t1, dt0, stepsize_controller, tprev, tnext = _without_derivative(fixed)
         saveat = eqx.tree_at(_saved_times, saveat, replace_fn=_without_derivative)
@@ -166,6 +167,14 @@ def _backward(residuals, cotangents, perturbed, differentiable, record):
     saved = [rows(s, bar) for s, bar in zip(saved, ys_bar, strict=True)]
     replay_bar, y0_bar = replay_backwards(replay, perturbed[0], record, num_steps, saved, y0, last)
     return replay_bar, y0_bar, eqx.filter(forward, lambda leaf: False)
+
+
+def _twice_differentiable(solver: Any) -> Any:
+    """Diffrax's loop over the stages of a step is of a kind that has no derivative forwards of the
+    one backwards, unless it is told otherwise (as its own `DirectAdjoint` does)."""
+    if getattr(solver, "scan_kind", "none") is not None:
+        return solver
+    return eqx.tree_at(lambda s: s.scan_kind, solver, "bounded", is_leaf=lambda x: x is None)
 
 
 def _saved_times(saveat: dfx.SaveAt) -> list[Any]:
