@@ -27,7 +27,7 @@ ADJOINTS: dict[str, dfx.AbstractAdjoint] = {
 }
 # The one that has to be refused: its gradient would be wrong through corrections.
 REFUSED = "backsolve"
-# Diffrax's own, which cannot be differentiated forwards once more.
+# Diffrax's own, which cannot always be differentiated forwards once more.
 ONCE = "checkpointed"
 
 
