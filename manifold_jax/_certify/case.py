@@ -10,6 +10,7 @@ import jax
 import jax.flatten_util as jfu
 import jax.numpy as jnp
 import numpy as np
+import optimistix as optx
 from jaxtyping import Array, Float
 
 from .._compare.approaches import Approach
@@ -48,7 +49,7 @@ class Case:
     ) -> "Case":
         """Solve once, adaptively, and keep the steps. Raises `RuntimeError` if that fails."""
         if isinstance(solver, dfx.AbstractImplicitSolver):  # has no tolerances from given steps
-            exact = dfx.VeryChord(rtol=_STAGES, atol=_STAGES)
+            exact = optx.Chord(rtol=_STAGES, atol=_STAGES)
             solver = eqx.tree_at(lambda s: s.root_finder, solver, exact)
         case = Case(problem, approach, solver, gain, t1, np.empty(0))
         controller = dfx.PIDController(rtol=tolerance, atol=tolerance)
