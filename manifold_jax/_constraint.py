@@ -12,7 +12,6 @@ import jax.tree_util as jtu
 from jaxtyping import Array, Float
 
 from ._custom_types import Args, FloatScalar, RealScalarLike, Residual, ResidualFunction, Y
-from ._linear import largest
 
 
 class AbstractConstraint(eqx.Module):
@@ -142,7 +141,7 @@ def row_scale(G: Float[Array, "m n"], x: Float[Array, " n"]) -> Float[Array, " m
     This is row equilibration (Sudarsan & Keerthi 1998, eqs. (3.3)-(3.4), with the typical
     sizes taken from the state).
     """
-    scale = largest(jnp.abs(G) * (jnp.abs(x) + 1)[None, :])
+    scale = jnp.max(jnp.abs(G) * (jnp.abs(x) + 1)[None, :], axis=1)
     return jnp.maximum(scale, jnp.finfo(G.dtype).tiny)
 
 
@@ -251,4 +250,4 @@ def _violation(constraint: AbstractConstraint, t: Array, y: Y, args: Args) -> Fl
     check_constraint(constraint, t, y, args)
     x, unravel = jfu.ravel_pytree(y)
     r, G = jacobian(lambda x: residual_vector(constraint, t, unravel(x), args), x)
-    return largest(jnp.abs(r) / row_scale(G, x))
+    return jnp.max(jnp.abs(r) / row_scale(G, x))

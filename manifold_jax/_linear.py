@@ -5,8 +5,6 @@ mechanism and cannot be fused across a batch. Up to `UNROLL_LIMIT` rows the elim
 is therefore written out entry by entry; beyond that the library routine is used.
 """
 
-import functools
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -110,20 +108,18 @@ def _factorize_with_library(A: Float[Array, "m m"], threshold: float) -> Factori
 
 
 def gram(A: Float[Array, "i n"], B: Float[Array, "k n"]) -> Float[Array, "i k"]:
-    """`A B^T`; small ones written out, as tiny `dot`s and reductions in a batch are slow: XLA
-    makes calls of a library of them, which cannot be fused with what is around."""
+    """`A B^T`; small ones as a sum that fuses, as batched tiny `dot`s are slow."""
     if max(A.shape[0], B.shape[0]) > UNROLL_LIMIT:
         return A @ B.T
-    if A.shape[1] > UNROLL_LIMIT:
-        return jnp.sum(A[:, None, :] * B[None, :, :], axis=2)
+    return jnp.sum(A[:, None, :] * B[None, :, :], axis=2)
+
+
+def gram_written_out(A: Float[Array, "i n"], B: Float[Array, "k n"]) -> Float[Array, "i k"]:
+    """`A B^T` for what is evaluated at every stage: more to compile, but without the reductions
+    for which XLA calls a library if the batch is large, and which then do not fuse."""
+    if max(*A.shape, B.shape[0]) > UNROLL_LIMIT:
+        return gram(A, B)
     return sum(A[:, None, j] * B[None, :, j] for j in range(A.shape[1]))
-
-
-def largest(x: Float[Array, "*rows n"]) -> Float[Array, "*rows"]:
-    """The maximum of each row."""
-    if x.shape[-1] > UNROLL_LIMIT:
-        return jnp.max(x, axis=-1)
-    return functools.reduce(jnp.maximum, [x[..., j] for j in range(x.shape[-1])])
 
 
 def combine(weights: Float[Array, " m"], rows: Float[Array, "m n"]) -> Float[Array, " n"]:

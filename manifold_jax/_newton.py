@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 
 from ._constraint import jacobian, row_scale
 from ._custom_types import Args, BoolScalar, FloatScalar, IntScalar
-from ._linear import combine, Factorization, factorize, gram, largest, PseudoInverse
+from ._linear import combine, Factorization, factorize, gram, PseudoInverse
 
 
 class CorrectionProblem(NamedTuple):
@@ -85,7 +85,7 @@ class _Equations(NamedTuple):
         return r, self.level(r)
 
     def level(self, r: Float[Array, " m"]) -> FloatScalar:
-        return largest(jnp.abs(r) / self.scale)
+        return jnp.max(jnp.abs(r) / self.scale)
 
     def lowered(self, state: _Iterate, dz: Float[Array, " m"]) -> _Iterate:
         """The step `z - dz` if it lowers the residual, else the state as it was."""

@@ -24,7 +24,6 @@ from ._constraint import (
     residual_vector,
 )
 from ._custom_types import Args, BoolScalar, FloatScalar, IntScalar, RealScalarLike, Y
-from ._linear import largest
 from ._mechanics import MechanicalConstraint
 from ._mechanics.constraint import Kinematics
 from ._newton import correct_once, CorrectionProblem, CorrectionRoot, solve_correction
@@ -218,7 +217,7 @@ class NewtonProjection(eqx.Module):
 
 def _information(x: Float[Array, " n"], *roots: CorrectionRoot) -> ProjectionInfo:
     moved = jnp.concatenate([root.p for root in roots]) - x
-    correction = largest(jnp.abs(moved) / (jnp.abs(x) + 1))
+    correction = jnp.max(jnp.abs(moved) / (jnp.abs(x) + 1))
     return ProjectionInfo(
         multipliers=-jnp.concatenate([root.z for root in roots]),
         iterations=functools.reduce(jnp.add, [root.iterations for root in roots]),

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._custom_types import Args, RealScalarLike, Y
-from .._linear import combine, factorize, gram
+from .._linear import combine, factorize, gram, gram_written_out
 from .constraint import check_mechanical_state, Kinematics, MechanicalConstraint
 from .lagrangian import LagrangianForce
 from .mass import ConfigurationMass, LagrangianMass, Mass
@@ -184,7 +184,7 @@ class _Motion:
         self.mass: Mass = self.equations.mass(self.t, self.x, self.w, args, self.C)
         self.directions = self.mass.solve(self.C)
         self.redundant = system.redundant
-        self.factorization = factorize(gram(self.C, self.directions), system.redundant)
+        self.factorization = factorize(gram_written_out(self.C, self.directions), system.redundant)
 
     def solve(self, bias: Float[Array, " m"]) -> tuple[Float[Array, " n"], Float[Array, " m"]]:
         """Accelerations and multipliers of `M a + C^T lambda = Q`, `C a = -bias`."""
