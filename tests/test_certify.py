@@ -80,6 +80,6 @@ def test_command(tmp_path):
     assert row["tangency"] < 1e-12
     ways = {check["adjoint"]: check for check in row["checks"]}
     assert "BacksolveAdjoint" in ways["backsolve"]["refused"]
-    assert ways["checkpointed"]["hessian"] is None  # refused by Diffrax
+    assert ways["checkpointed"]["hessian"] < 1e-10
     assert ways["replay"]["hessian"] < 1e-10
     assert ways["replay"]["difference"] < 1e-12
