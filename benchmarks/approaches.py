@@ -20,6 +20,7 @@ from manifold_jax._compare.with_diffrax import SOLVERS
 from manifold_jax.problems import ALL
 
 from ._approach_results import measure, prepare, Row, Setting, setting
+from ._approach_summary import equal_error_table, summary_table
 from ._approach_tables import accuracy_table, cost_table, failures
 from ._candidates import MAX_STEPS, OUTPUT_POINTS, SCIPY_METHODS
 from ._measure import environment, make_console, use_double_precision, write_json
@@ -117,6 +118,8 @@ def main(
         own = [row for row in rows if row.problem == name]
         console.print(cost_table(name, settings[name], own, typical))
         console.print(accuracy_table(name, own, tolerances[1::2]))
+    console.print(summary_table(rows))
+    console.print(equal_error_table(rows))
     for line in failures(rows):
         console.print(line)
     if json is not None:

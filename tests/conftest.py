@@ -1,4 +1,6 @@
+import gc
 import os
+from pathlib import Path
 
 
 # The tests check numbers, not speed: compile twice as fast. Has to be set before JAX starts.
@@ -13,12 +15,25 @@ jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
 
+MAPPINGS = Path("/proc/self/maps")
+MOST_MAPPINGS = 30_000
+
 
 @pytest.fixture(autouse=True, scope="module")
 def _bounded_memory():
     """Compiled programs of one file are of no use to the next, and there are many."""
     yield
     jax.clear_caches()
+
+
+@pytest.fixture(autouse=True)
+def _bounded_mappings():
+    """Every compiled program takes memory mappings; Linux allows a process 65530 of them, and
+    beyond that the compiler crashes."""
+    yield
+    if MAPPINGS.exists() and MAPPINGS.read_text().count("\n") > MOST_MAPPINGS:
+        jax.clear_caches()
+        gc.collect()
 
 
 @pytest.fixture

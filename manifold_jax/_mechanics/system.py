@@ -192,7 +192,7 @@ class _Motion:
         if self.mass.augmentation is not None:
             force = force - combine(self.mass.augmentation * bias, self.C)
         free = self.mass.solve(force)
-        multipliers = self.factorization.solve(combine(free, self.C.T) + bias)
+        multipliers = self.factorization.solve(gram_written_out(self.C, free[None, :])[:, 0] + bias)
         # Added, not selected: the derivative of a discarded NaN would be NaN.
         valid = self.mass.valid & self.factorization.full_rank
         undefined = jnp.where(valid, 0, jnp.nan).astype(free.dtype)
