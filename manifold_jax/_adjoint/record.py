@@ -1,4 +1,4 @@
-"""A loop that records the accepted steps while it runs."""
+"""A loop that records its steps while it runs."""
 
 from collections.abc import Callable
 from typing import Any
@@ -6,46 +6,95 @@ from typing import Any
 import equinox as eqx
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
-from .._compat import buffer_at_set, MaybeBuffer, while_loop
+from .._compat import buffer_at_set, MaybeBuffer, unvmap_max, while_loop
 from .._custom_types import IntScalar, Y
 
 
-# Steps that the way back takes out of the record at once: those of the trajectories of a batch
-# then lie close to each other in memory.
-_BLOCK = 64
+# Bytes up to which XLA for CPUs takes an array to be small. It runs the operations of a loop one
+# after the other if all their arrays are, and hands them to threads if not, which takes longer
+# than a step of a small system.
+_SMALL = 512
+_FEWEST, _MOST = 8, 64
 
 
 class Record(eqx.Module):
-    """The accepted steps of a solve: where each began and ended, and every `stride`-th state
-    from which one was made. Unused rows of the times hold infinity."""
+    """The steps of a solve in blocks, rejected ones included: where each began and ended, its
+    number among the accepted ones, and the states from which they were made, all of them or
+    the first of each block.
 
-    starts: MaybeBuffer[Float[Array, " steps"]]
-    ends: MaybeBuffer[Float[Array, " steps"]]
-    states: Y  # leading axis: steps / stride
-    stride: int = eqx.field(static=True)
-    block: int = eqx.field(static=True)  # steps between two states, or that are handled together
+    Rejected steps take rows so that the trajectories of a batch, which have the same number of
+    steps until they end, write to the same row: an index of its own for each would make a
+    slice a scatter, which takes longer than the step. Unused rows of the times hold infinity.
+    """
+
+    starts: MaybeBuffer[Float[Array, "blocks block"]]
+    ends: MaybeBuffer[Float[Array, "blocks block"]]
+    numbers: MaybeBuffer[Int[Array, "blocks block"]]  # from 1; 0 if rejected or unused
+    states: Y  # leading axes: blocks, and block if there are all of them
+    every_state: bool = eqx.field(static=True)
 
     @staticmethod
     def empty(y: Y, time_dtype: Any, max_steps: int, stride: int) -> "Record":
-        block = min(_BLOCK, max_steps) if stride == 1 else stride
-        size = -(-max_steps // block) * block
-        rows = size // stride
-        times = jnp.full((size,), jnp.inf, time_dtype)
-        states = jtu.tree_map(lambda leaf: jnp.zeros((rows, *leaf.shape), leaf.dtype), y)
-        return Record(times, times, states, stride, block)
+        block = min(_block_length(y), max_steps) if stride == 1 else stride
+        one = _Block.empty(y, time_dtype, block, stride == 1)
+        states = jtu.tree_map(jnp.zeros_like, y) if one.states is None else one.states
+        repeat = lambda x: jnp.broadcast_to(x, (-(-max_steps // block), *x.shape))
+        columns = one.starts, one.ends, one.numbers, states
+        return Record(*jtu.tree_map(repeat, columns), stride == 1)
 
-    def including(self, i: IntScalar, start: Any, end: Any, y: Y, accepted: Any) -> "Record":
-        put = lambda buffer, i, x, pred: buffer_at_set(buffer, i, x, pred=pred)
-        kept = accepted & (i % self.stride == 0)
+    @property
+    def block(self) -> int:
+        return self.starts.shape[1]
+
+    def steps_at(self, times: Float[Array, " rows"]) -> Int[Array, " rows"]:
+        """The accepted steps in which sorted times lie."""
+        accepted = self.numbers > 0
+        # Others are of no length here: at most `t0` lies at the end of one, if it is the first.
+        ends = jnp.where(accepted, self.ends, self.starts).reshape(-1)
+        return jnp.maximum(jnp.searchsorted(ends, times).astype(int), jnp.argmax(accepted))
+
+    def including(self, i: IntScalar, block: "_Block", start: Y) -> "Record":
+        put = lambda buffer, x: buffer_at_set(buffer, i, x)
+        states = block.states if self.every_state else start
         return Record(
-            put(self.starts, i, start, accepted),
-            put(self.ends, i, end, accepted),
-            jtu.tree_map(lambda x, b: put(b, i // self.stride, x, kept), y, self.states),
-            self.stride,
-            self.block,
+            put(self.starts, block.starts),
+            put(self.ends, block.ends),
+            put(self.numbers, block.numbers),
+            jtu.tree_map(lambda x, b: put(b, x), states, self.states),
+            self.every_state,
         )
+
+
+class _Block(eqx.Module):
+    """What is recorded before it is put into the record."""
+
+    starts: MaybeBuffer[Float[Array, " block"]]
+    ends: MaybeBuffer[Float[Array, " block"]]
+    numbers: MaybeBuffer[Int[Array, " block"]]
+    states: Y | None
+
+    @staticmethod
+    def empty(y: Y, time_dtype: Any, length: int, every_state: bool) -> "_Block":
+        times = jnp.full((length,), jnp.inf, time_dtype)
+        rows = jtu.tree_map(lambda leaf: jnp.zeros((length, *leaf.shape), leaf.dtype), y)
+        numbers = jnp.zeros((length,), int)
+        return _Block(times, times, numbers, rows if every_state else None)
+
+    def including(self, i: IntScalar, start: Any, end: Any, number: Any, y: Y) -> "_Block":
+        put = lambda x, buffer: buffer_at_set(buffer, i, x)
+        return _Block(
+            put(start, self.starts),
+            put(end, self.ends),
+            put(number, self.numbers),
+            None if self.states is None else jtu.tree_map(put, y, self.states),
+        )
+
+
+def _block_length(y: Y) -> int:
+    largest = max(leaf.nbytes for leaf in jtu.tree_leaves(y))
+    return max(_FEWEST, min(_MOST, _SMALL // max(largest, 1)))
 
 
 def recording(record: Record, run: Callable) -> tuple[Any, Record]:
@@ -55,23 +104,30 @@ def recording(record: Record, run: Callable) -> tuple[Any, Record]:
     def loop(cond_fun, body_fun, init_val, *, max_steps, buffers):
         nonlocal written
 
-        def body(carry):
-            state, record = carry
+        def goes_on(carry):
+            state, _ = carry
+            return cond_fun(state) & (state.num_steps < max_steps)
+
+        def step(carry):
+            state, block = carry
             new = body_fun(state)
             accepted = new.num_accepted_steps > state.num_accepted_steps
-            record = record.including(
-                state.num_accepted_steps, state.tprev, state.tnext, state.y, accepted
-            )
-            return new, record
+            number = jnp.where(accepted, new.num_accepted_steps, 0)
+            i = unvmap_max(state.num_steps) % record.block
+            return new, block.including(i, state.tprev, state.tnext, number, state.y)
 
-        final, written = while_loop(
-            lambda carry: cond_fun(carry[0]),
-            body,
-            (init_val, record),
-            max_steps=max_steps,
-            buffers=lambda carry: buffers(carry[0]) + jtu.tree_leaves(carry[1]),
-            kind="lax",
-        )
+        def through_block(carry):
+            state, record = carry
+            i, start = unvmap_max(state.num_steps) // record.block, state.y
+            empty = _Block.empty(start, state.tprev.dtype, record.block, record.every_state)
+            state, block = nested(step, (state, empty), record.block)
+            return state, record.including(i, block, start)
+
+        def nested(body, carry, most):
+            both = lambda carry: buffers(carry[0]) + jtu.tree_leaves(carry[1])
+            return while_loop(goes_on, body, carry, max_steps=most, buffers=both, kind="lax")
+
+        final, written = nested(through_block, (init_val, record), record.starts.shape[0])
         return final
 
     out = run(loop)

@@ -17,7 +17,7 @@ from .record import Record
 
 
 # Interpolated values whose steps are transposed side by side.
-_CHUNK = 64
+_CHUNK = 32
 
 
 class Saving(eqx.Module):
@@ -67,9 +67,11 @@ class Replay(eqx.Module):
 
 
 class Rows(NamedTuple):
-    """What one of the savings has saved: times, how many rows are used, their cotangents."""
+    """What one of the savings has saved: times, the steps in which they lie, how many rows are
+    used, their cotangents."""
 
     times: Float[Array, " rows"]
+    steps: Int[Array, " rows"]
     count: IntScalar
     cotangents: Any  # leading axis: rows
 
@@ -80,6 +82,7 @@ class _Block(NamedTuple):
     first: IntScalar
     starts: Float[Array, " steps"]
     ends: Float[Array, " steps"]
+    numbers: Int[Array, " steps"]  # among the accepted ones, from 1; 0 for others
     states: Y  # leading axis: steps
 
 
@@ -94,17 +97,18 @@ def replay_backwards(
     replay: Replay,
     perturbed: Any,
     record: Record,
-    num_steps: IntScalar,
+    counts: tuple[IntScalar, IntScalar],
     rows: list[Rows],
     y0: Y,
     last: tuple[RealScalarLike, Y],
 ) -> tuple[Any, Y]:
-    """Gradients with respect to the leaves of `replay` and to `y0`."""
+    """Gradients with respect to the leaves of `replay` and to `y0`. `counts` are the numbers of
+    all steps and of the accepted ones."""
     leaves, rest = eqx.partition(replay, perturbed)
-    back = _Backwards(leaves, rest, record, num_steps, rows)
+    back = _Backwards(leaves, rest, record, *counts, rows)
     gradient = _Gradient(*jtu.tree_map(jnp.zeros_like, (y0, leaves)))
     gradient = back.through_end(gradient, *last)
-    total = unvmap_max(num_steps)
+    total = unvmap_max(counts[0])
     num_blocks = -(-total // record.block)
 
     def through_block(carry):
@@ -112,7 +116,7 @@ def replay_backwards(
         return i - 1, back.through_block(gradient, back.block(i - 1), total)
 
     _, gradient = lax.while_loop(lambda carry: carry[0] > 0, through_block, (num_blocks, gradient))
-    gradient = back.through_start(gradient, record.starts[0], y0)
+    gradient = back.through_start(gradient, record.starts[0, 0], y0)
     return gradient.leaves, gradient.y
 
 
@@ -121,12 +125,13 @@ class _Backwards(eqx.Module):
     rest: Any
     record: Record
     num_steps: IntScalar
+    num_accepted: IntScalar
     rows: list[Rows]
 
     def through_end(self, gradient: _Gradient, t: RealScalarLike, y: Y) -> _Gradient:
         for k, saving in enumerate(self.rest.savings):
             if saving.end:
-                unsaved = saving.steps == 0 or self.num_steps % saving.steps != 0
+                unsaved = saving.steps == 0 or self.num_accepted % saving.steps != 0
                 last = jnp.arange(len(self.rows[k].times)) == self.rows[k].count - 1
                 gradient = self._add_rows(gradient, k, last & unsaved, t, y)
         return gradient
@@ -158,14 +163,15 @@ class _Backwards(eqx.Module):
 
     def block(self, i: IntScalar) -> _Block:
         record = self.record
-        first = i * record.block
-        live = first + jnp.arange(record.block) < self.num_steps
-        take = lambda x: lax.dynamic_slice_in_dim(x, first, record.block)
-        # Rows of no step hold the first one: functions may refuse what is not a state or time.
-        used = lambda x: jnp.where(live.reshape(live.shape + (1,) * (x.ndim - 1)), take(x), x[0])
+        # Rows of no accepted step hold the first one: functions may refuse what is not a state
+        # or time.
+        live = record.numbers[i] > 0
+        used = lambda x: jnp.where(live.reshape(live.shape + (1,) * (x.ndim - 2)), x[i], x[0, 0])
         starts, ends = used(record.starts), used(record.ends)
-        if record.stride == 1:
-            return _Block(first, starts, ends, jtu.tree_map(used, record.states))
+        first = i * record.block
+        if record.every_state:
+            states = jtu.tree_map(used, record.states)
+            return _Block(first, starts, ends, record.numbers[i], states)
 
         def advance(y, xs):
             start, end, live = xs
@@ -176,7 +182,7 @@ class _Backwards(eqx.Module):
         unfinished = first < self.num_steps
         start = jtu.tree_map(lambda y: jnp.where(unfinished, y[i], y[0]), record.states)
         _, states = lax.scan(advance, start, (starts, ends, live))
-        return _Block(first, starts, ends, states)
+        return _Block(first, starts, ends, record.numbers[i], states)
 
     def through_block(self, gradient: _Gradient, block: _Block, total: IntScalar) -> _Gradient:
         size = block.starts.shape[0]
@@ -194,8 +200,8 @@ class _Backwards(eqx.Module):
         return lax.while_loop(lambda carry: carry[0] > 0, through_step, start)[1]
 
     def _through_step(self, gradient: _Gradient, block: _Block, bars: Y, i: IntScalar) -> _Gradient:
-        number = block.first + i + 1  # of accepted steps after this one
-        live = number <= self.num_steps
+        number = block.numbers[i]
+        live = number > 0
         at = lambda tree: jtu.tree_map(lambda x: x[i], tree)
 
         def saved_bar(saving: Saving, rows: Rows) -> Any:
@@ -221,8 +227,7 @@ class _Backwards(eqx.Module):
         which its steps were made, and to the leaves."""
         saving, rows = self.rest.savings[k], self.rows[k]
         size = block.starts.shape[0]
-        row = jnp.arange(len(rows.times))
-        step = jnp.searchsorted(self.record.ends, rows.times).astype(self.num_steps.dtype)
+        row, step = jnp.arange(len(rows.times)), rows.steps
         valid = (row >= saving.offset) & (row < saving.offset + saving.num_times)
         valid &= (row < rows.count) & (step < self.num_steps)
         first = saving.offset + jnp.sum(valid & (step < block.first))

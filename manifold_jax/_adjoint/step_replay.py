@@ -148,24 +148,25 @@ def _forward(perturbed, differentiable, record):
     (final_state, statistics), record = forward(record)
     saved = save_states(final_state)
     last = final_state.tprev, final_state.y
-    residuals = record, final_state.num_accepted_steps, last, saved
+    counts = final_state.num_steps, final_state.num_accepted_steps
+    residuals = record, counts, last, saved
     return ((final_state, statistics), [s.ys for s in saved]), residuals
 
 
 @_solve.def_bwd
 def _backward(residuals, cotangents, perturbed, differentiable, record):
     del record
-    record, num_steps, last, saved = residuals
+    record, counts, last, saved = residuals
     replay, y0, forward = differentiable
     _, ys_bar = cotangents
 
     def rows(saved, bar):
         filled = lambda b, y: jnp.zeros_like(y) if b is None else b
         bar = jtu.tree_map(filled, bar, saved.ys, is_leaf=lambda x: x is None)
-        return Rows(saved.ts, saved.save_index, bar)
+        return Rows(saved.ts, record.steps_at(saved.ts), saved.save_index, bar)
 
     saved = [rows(s, bar) for s, bar in zip(saved, ys_bar, strict=True)]
-    replay_bar, y0_bar = replay_backwards(replay, perturbed[0], record, num_steps, saved, y0, last)
+    replay_bar, y0_bar = replay_backwards(replay, perturbed[0], record, counts, saved, y0, last)
     return replay_bar, y0_bar, eqx.filter(forward, lambda leaf: False)
 
 
