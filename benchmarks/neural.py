@@ -169,7 +169,16 @@ def result_table(rows: list[Row]) -> Table:
     table = Table(title=title, title_justify="left")
     for heading in ("system", "constraint"):
         table.add_column(heading, no_wrap=True)
-    headings = ("training, s", "loss", "violation", "scaled", "median", "state error", "at end", "lost")
+    headings = (
+        "training, s",
+        "loss",
+        "violation",
+        "scaled",
+        "median",
+        "state error",
+        "at end",
+        "lost",
+    )
     for heading in headings:
         table.add_column(heading, justify="right")
     for row in rows:

@@ -48,6 +48,16 @@ class ProjectionInfo(eqx.Module):
     full_rank: BoolScalar
     success: BoolScalar
 
+    @staticmethod
+    def of_nothing(y: Y, success: BoolScalar) -> "ProjectionInfo":
+        """For a state that has been left as it was."""
+        dtype = jnp.result_type(*jtu.tree_leaves(y))
+        zero = jnp.zeros((), dtype)
+        none = jnp.zeros((0,), dtype)
+        return ProjectionInfo(
+            none, jnp.zeros((), jnp.int32), zero, zero, jnp.asarray(True), success
+        )
+
 
 class NewtonProjection(eqx.Module):
     """Projects by a simplified Newton iteration on the `m` multipliers.

@@ -1,5 +1,6 @@
 """A loop that records its steps while it runs."""
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -92,9 +93,18 @@ class _Block(eqx.Module):
         )
 
 
+def default_stride(y: Y, max_steps: int) -> int:
+    """Steps between two recorded states: few if the states between them are small, so that the
+    way back handles small arrays only; else such that memory is least."""
+    return _FEWEST if _FEWEST * _largest_leaf(y) <= _SMALL else math.isqrt(max_steps)
+
+
 def _block_length(y: Y) -> int:
-    largest = max(leaf.nbytes for leaf in jtu.tree_leaves(y))
-    return max(_FEWEST, min(_MOST, _SMALL // max(largest, 1)))
+    return max(_FEWEST, min(_MOST, _SMALL // max(_largest_leaf(y), 1)))
+
+
+def _largest_leaf(y: Y) -> int:
+    return max(leaf.nbytes for leaf in jtu.tree_leaves(y))
 
 
 def recording(record: Record, run: Callable) -> tuple[Any, Record]:

@@ -13,6 +13,8 @@ from jaxtyping import Array, Bool, Float, Int
 
 from .._compat import unvmap_max
 from .._custom_types import Args, IntScalar, RealScalarLike, Y
+from .._projection import ProjectionInfo
+from .._solver.explicit import explicit_step, is_unrollable
 from .record import Record
 
 
@@ -42,6 +44,13 @@ class Replay(eqx.Module):
         subs = jtu.tree_leaves(saveat.subs, is_leaf=lambda x: isinstance(x, dfx.SubSaveAt))
 
         def attempt(start, end, y):
+            if is_unrollable(solver, terms, start, end, y, args):  # a solver of Diffrax itself
+                unchanged = lambda y: (y, ProjectionInfo.of_nothing(y, jnp.asarray(True)))
+                f0 = terms.vf(start, y, args)
+                y1, _, _, dense_info, _, _ = explicit_step(
+                    solver.tableau, terms, terms, start, end, y, args, f0, unchanged
+                )
+                return y1, dense_info
             state = solver.init(terms, start, end, y, args)
             y1, _, dense_info, _, _ = solver.step(terms, start, end, y, args, state, False)
             return y1, dense_info

@@ -1,6 +1,5 @@
 """Reverse mode that goes back through the recorded steps, each computed once more."""
 
-import math
 from typing import Any
 
 import diffrax as dfx
@@ -16,7 +15,7 @@ from .._compat import (
     save_states,
     while_loop,
 )
-from .record import Record, recording
+from .record import default_stride, Record, recording
 from .replay import Replay, replay_backwards, Rows
 
 
@@ -37,11 +36,12 @@ class StepReplayAdjoint(dfx.AbstractAdjoint):
 
     **Arguments:**
 
-    - `checkpoints`: the largest number of states to record, by default about
-        `sqrt(max_steps)`. Every `ceil(max_steps / checkpoints)`-th state is kept, and those
-        between two of them are computed again, one more pass over the steps altogether; with
-        `checkpoints=max_steps` none. Memory: `2 max_steps` times, `checkpoints` states, and
-        the states between two of them.
+    - `checkpoints`: the largest number of states to record, by default `max_steps / 8` for
+        small states (arrays of up to 64 bytes) and about `sqrt(max_steps)` for others. Every
+        `ceil(max_steps / checkpoints)`-th state is kept, and those between two of them are
+        computed again, one more pass over the steps altogether; with `checkpoints=max_steps`
+        none, which is the fastest for one trajectory, but seldom for a batch. Memory:
+        `3 max_steps` numbers, `checkpoints` states, and the states between two of them.
 
     Works with any solver of Diffrax or this library, adaptive or constant steps, and
     `SaveAt` with `t0`, `t1`, `ts`, `steps` and `fn`. Derivatives with respect to `y0`,
@@ -96,8 +96,11 @@ class StepReplayAdjoint(dfx.AbstractAdjoint):
         saveat = eqx.tree_at(_saved_times, saveat, replace_fn=_without_derivative)
         init_state = eqx.tree_at(lambda s: (s.tprev, s.tnext), init_state, (tprev, tnext))
         y0 = init_state.y
-        checkpoints = math.isqrt(max_steps) if self.checkpoints is None else self.checkpoints
-        record = Record.empty(y0, tprev.dtype, max_steps, -(-max_steps // checkpoints))
+        checkpoints = self.checkpoints
+        stride = (
+            default_stride(y0, max_steps) if checkpoints is None else -(-max_steps // checkpoints)
+        )
+        record = Record.empty(y0, tprev.dtype, max_steps, stride)
 
         def forward(record):
             run = lambda outer: diffrax_loop(

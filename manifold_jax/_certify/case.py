@@ -148,7 +148,7 @@ class Case:
 
 
 def differences(value: Callable[[np.ndarray], float], theta: np.ndarray) -> np.ndarray:
-    """Central differences of sixth order, `theta_i` changed by at most 4e-3 of its size."""
+    """Central differences of sixth order, `theta_i` changed by at most 4e-4 of its size."""
     gradient = np.empty_like(theta)
     for i, size in enumerate(np.maximum(np.abs(theta), 0.1)):
         unit = np.eye(theta.size)[i]
@@ -156,7 +156,7 @@ def differences(value: Callable[[np.ndarray], float], theta: np.ndarray) -> np.n
         def slope(h: float, unit: np.ndarray = unit) -> float:
             return (value(theta + h * unit) - value(theta - h * unit)) / (2 * h)
 
-        h = 1e-3 * size
+        h = 1e-4 * size
         fine, middle, coarse = slope(h), slope(2 * h), slope(4 * h)
         better, good = (4 * fine - middle) / 3, (4 * middle - coarse) / 3
         gradient[i] = (16 * better - good) / 15

@@ -3,13 +3,12 @@
 from typing import Any
 
 import diffrax as dfx
-import jax
 import jax.numpy as jnp
 from diffrax import RESULTS
 
 from .._compat import is_sde, time_direction
 from .._constraint import AbstractConstraint, check_constraint
-from .._custom_types import Args, BoolScalar, RealScalarLike, Y
+from .._custom_types import Args, RealScalarLike, Y
 from .._interpolation import CorrectedInterpolationFactory
 from .._projection import NewtonProjection, ProjectionInfo
 from .._stabilization import (
@@ -117,7 +116,7 @@ class Stabilized(AbstractManifoldSolver):
 
         def correct(y: Y) -> tuple[Y, ProjectionInfo]:
             if not self.corrects_output:
-                return y, _no_correction(y, stable)
+                return y, ProjectionInfo.of_nothing(y, stable)
             return self.projection(self.constraint, time, y, args, fallback=y0)
 
         terms = self._stabilized(terms)
@@ -137,10 +136,3 @@ class Stabilized(AbstractManifoldSolver):
             )
 
         return rewrite_terms(terms, lambda term: RewrittenTerm(term, field))
-
-
-def _no_correction(y: Y, success: BoolScalar) -> ProjectionInfo:
-    dtype = jnp.result_type(*jax.tree_util.tree_leaves(y))
-    zero = jnp.zeros((), dtype)
-    none = jnp.zeros((0,), dtype)
-    return ProjectionInfo(none, jnp.zeros((), jnp.int32), zero, zero, jnp.asarray(True), success)
