@@ -1,5 +1,7 @@
 """Reverse mode by replaying recorded steps: the gradient of Diffrax, by another way."""
 
+import re
+
 import diffrax as dfx
 import equinox as eqx
 import jax
@@ -21,7 +23,9 @@ def pendulum_field(t, y, gravity):
     return v, -mu * q - gravity * jnp.array([0.0, 1.0])
 
 
-def saved(theta, adjoint, hook, saveat, solver, t1=2.0, controller=CONTROLLER, max_steps=200):
+def saved(
+    theta, adjoint, hook, saveat, solver, t1=2.0, controller=CONTROLLER, max_steps=200, dt0=None
+):
     """A pendulum of gravity and length `theta[:2]`, started with the speed `theta[2]`."""
     gravity, length, speed = theta
     # the length is closed over, gravity an argument
@@ -41,7 +45,7 @@ def saved(theta, adjoint, hook, saveat, solver, t1=2.0, controller=CONTROLLER, m
         wrapped,
         0.0,
         t1,
-        0.03 if controller is not CONTROLLER else None,
+        dt0,
         y0,
         gravity,
         saveat=saveat,
@@ -129,9 +133,10 @@ def test_every_approach(hook):
 @pytest.mark.parametrize("solver", [slow(dfx.Dopri8()), slow(dfx.Kvaerno5()), dfx.Heun()], ids=str)
 def test_solvers(solver):
     """Steps in a loop, implicit stages, and constant steps."""
-    controller = dfx.ConstantStepSize() if isinstance(solver, dfx.Heun) else CONTROLLER
-    case = mj.Projected, SAVEATS["t0, ts, t1"], solver
-    agree(*gradients(*case, controller=controller, max_steps=500))
+    options = dict(max_steps=500)
+    if isinstance(solver, dfx.Heun):
+        options |= dict(controller=dfx.ConstantStepSize(), dt0=0.03)
+    agree(*gradients(mj.Projected, SAVEATS["t0, ts, t1"], solver, **options))
 
 
 def test_backwards_in_time():
@@ -181,6 +186,64 @@ def test_batch_equals_single():
         np.testing.assert_allclose(row, single(theta), rtol=1e-11)
 
 
+def test_rejected_steps():
+    """They are recorded, too: the first one, where `t0` is saved, and others between."""
+    case = (mj.Projected, dfx.SaveAt(ts=jnp.linspace(0.0, 2.0, 40)), dfx.Tsit5())
+    controller = dfx.PIDController(rtol=1e-6, atol=1e-6, pcoeff=0, icoeff=1.6)
+    options = dict(controller=controller, dt0=1.5)
+
+    @jax.jit
+    def rejections(theta):
+        return saved(theta, dfx.ForwardMode(), *case, **options).stats["num_rejected_steps"]
+
+    thetas = jnp.stack([THETA, THETA * jnp.array([3.0, 0.5, 2.0])])
+    assert rejections(thetas[0]) > 10
+    assert rejections(thetas[0]) != rejections(thetas[1])
+    reverse, forward = gradients(*case, **options)
+    agree(reverse, forward)
+    gradient = jax.grad(lambda theta: loss(theta, mj.StepReplayAdjoint(), *case, **options))
+    batch = jax.jit(jax.vmap(gradient))(thetas)
+    np.testing.assert_allclose(batch[0], reverse, rtol=1e-11)
+
+
+def test_a_rejected_first_step_without_a_value():
+    """The start is saved: its row lies at the end of no step, and must not pass that one's NaN."""
+    total = mj.Constraint(lambda t, y, args: jnp.sum(y) - 1)
+
+    def value(rate, adjoint):
+        flow = lambda t, y, args: rate * jnp.sqrt(y[0]) * jnp.array([-1.0, 1.0])
+        sol = mj.diffeqsolve(
+            dfx.ODETerm(flow),
+            mj.Projected(dfx.Tsit5(), total),
+            0.0,
+            1.0,
+            1.0,  # too large: the root of what is negative
+            jnp.array([1.0, 0.0]),
+            saveat=dfx.SaveAt(ts=jnp.linspace(0.0, 1.0, 5)),
+            stepsize_controller=CONTROLLER,
+            max_steps=100,
+            adjoint=adjoint,
+        )
+        return jnp.sum(sol.ys[:, 0] ** 2), sol.stats["num_rejected_steps"]
+
+    rate = jnp.asarray(1.9)
+    forward, rejected = jax.jacfwd(lambda r: value(r, dfx.ForwardMode()), has_aux=True)(rate)
+    assert rejected > 0
+    reverse, _ = jax.grad(lambda r: value(r, mj.StepReplayAdjoint()), has_aux=True)(rate)
+    np.testing.assert_allclose(reverse, forward, rtol=1e-12)
+
+
+def test_the_record_of_a_batch_is_written_in_slices():
+    """An index of its own for each trajectory would make it a scatter."""
+    case = (mj.Projected, SAVEATS["t1"], dfx.Tsit5())
+    gradient = jax.grad(lambda theta: loss(theta, mj.StepReplayAdjoint(), *case, max_steps=208))
+    batch = jnp.stack([THETA, THETA, THETA])
+    program = jax.jit(jax.vmap(gradient)).lower(batch).compile().as_text()
+    written = re.findall(r"\[3,26,8\]\S* ([\w-]+)\(", program)  # trajectories, blocks, steps
+    assert "dynamic-update-slice" in written
+    assert "scatter" not in written
+
+
 def test_one_counter_for_the_whole_batch():
     """A counter for each trajectory would make every access to the record a gather."""
     case = (mj.Projected, SAVEATS["t0, ts, t1"], dfx.Tsit5())
@@ -227,7 +290,7 @@ def test_hessian_vector_product(hook, solver):
 def test_no_steps():
     """`t0 == t1`: everything saved is the start."""
     case = (mj.Projected, dfx.SaveAt(ts=jnp.zeros(3)), dfx.Tsit5())
-    reverse, forward = gradients(*case, t1=0.0, controller=dfx.ConstantStepSize())
+    reverse, forward = gradients(*case, t1=0.0, controller=dfx.ConstantStepSize(), dt0=0.03)
     np.testing.assert_allclose(reverse, forward, rtol=1e-12)
     assert reverse[0] == 0  # of gravity
     assert np.abs(reverse[1:]).min() > 0.1
