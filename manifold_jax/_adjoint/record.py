@@ -39,7 +39,7 @@ class Record(eqx.Module):
     @staticmethod
     def empty(y: Y, time_dtype: Any, max_steps: int, stride: int) -> "Record":
         block = min(_block_length(y), max_steps) if stride == 1 else stride
-        one = _Block.empty(y, time_dtype, block, stride == 1)
+        one = _Recent.empty(y, time_dtype, block, stride == 1)
         states = jtu.tree_map(jnp.zeros_like, y) if one.states is None else one.states
         repeat = lambda x: jnp.broadcast_to(x, (-(-max_steps // block), *x.shape))
         columns = one.starts, one.ends, one.numbers, states
@@ -56,7 +56,7 @@ class Record(eqx.Module):
         ends = jnp.where(accepted, self.ends, self.starts).reshape(-1)
         return jnp.maximum(jnp.searchsorted(ends, times).astype(int), jnp.argmax(accepted))
 
-    def including(self, i: IntScalar, block: "_Block", start: Y) -> "Record":
+    def including(self, i: IntScalar, block: "_Recent", start: Y) -> "Record":
         put = lambda buffer, x: buffer_at_set(buffer, i, x)
         states = block.states if self.every_state else start
         return Record(
@@ -68,8 +68,8 @@ class Record(eqx.Module):
         )
 
 
-class _Block(eqx.Module):
-    """What is recorded before it is put into the record."""
+class _Recent(eqx.Module):
+    """The block that is being recorded."""
 
     starts: MaybeBuffer[Float[Array, " block"]]
     ends: MaybeBuffer[Float[Array, " block"]]
@@ -77,15 +77,15 @@ class _Block(eqx.Module):
     states: Y | None
 
     @staticmethod
-    def empty(y: Y, time_dtype: Any, length: int, every_state: bool) -> "_Block":
+    def empty(y: Y, time_dtype: Any, length: int, every_state: bool) -> "_Recent":
         times = jnp.full((length,), jnp.inf, time_dtype)
         rows = jtu.tree_map(lambda leaf: jnp.zeros((length, *leaf.shape), leaf.dtype), y)
         numbers = jnp.zeros((length,), int)
-        return _Block(times, times, numbers, rows if every_state else None)
+        return _Recent(times, times, numbers, rows if every_state else None)
 
-    def including(self, i: IntScalar, start: Any, end: Any, number: Any, y: Y) -> "_Block":
+    def including(self, i: IntScalar, start: Any, end: Any, number: Any, y: Y) -> "_Recent":
         put = lambda x, buffer: buffer_at_set(buffer, i, x)
-        return _Block(
+        return _Recent(
             put(start, self.starts),
             put(end, self.ends),
             put(number, self.numbers),
@@ -129,7 +129,7 @@ def recording(record: Record, run: Callable) -> tuple[Any, Record]:
         def through_block(carry):
             state, record = carry
             i, start = unvmap_max(state.num_steps) // record.block, state.y
-            empty = _Block.empty(start, state.tprev.dtype, record.block, record.every_state)
+            empty = _Recent.empty(start, state.tprev.dtype, record.block, record.every_state)
             state, block = nested(step, (state, empty), record.block)
             return state, record.including(i, block, start)
 
