@@ -127,3 +127,10 @@ def combine(weights: Float[Array, " m"], rows: Float[Array, "m n"]) -> Float[Arr
     if rows.shape[0] > UNROLL_LIMIT:
         return weights @ rows
     return sum(weights[i] * rows[i] for i in range(rows.shape[0]))
+
+
+def multiply(A: Float[Array, "m n"], x: Float[Array, " n"]) -> Float[Array, " m"]:
+    """`A x`, not by the library either, whose batched small products are slow."""
+    if A.shape[1] > UNROLL_LIMIT:
+        return gram(A, x[None, :])[:, 0]
+    return combine(x, A.T)

@@ -80,7 +80,7 @@ class _Recent(eqx.Module):
     def empty(y: Y, time_dtype: Any, length: int, every_state: bool) -> "_Recent":
         times = jnp.full((length,), jnp.inf, time_dtype)
         rows = jtu.tree_map(lambda leaf: jnp.zeros((length, *leaf.shape), leaf.dtype), y)
-        numbers = jnp.zeros((length,), int)
+        numbers = jnp.zeros((length,), jnp.int32)
         return _Recent(times, times, numbers, rows if every_state else None)
 
     def including(self, i: IntScalar, start: Any, end: Any, number: Any, y: Y) -> "_Recent":
@@ -94,9 +94,9 @@ class _Recent(eqx.Module):
 
 
 def default_stride(y: Y, max_steps: int) -> int:
-    """Steps between two recorded states: few if the states between them are small, so that the
-    way back handles small arrays only; else such that memory is least."""
-    return _FEWEST if _FEWEST * _largest_leaf(y) <= _SMALL else math.isqrt(max_steps)
+    """Steps between two recorded states: one where states are small, hardly larger than the
+    times recorded with them; else such that memory is least."""
+    return 1 if _FEWEST * _largest_leaf(y) <= _SMALL else math.isqrt(max_steps)
 
 
 def _block_length(y: Y) -> int:
@@ -122,7 +122,7 @@ def recording(record: Record, run: Callable) -> tuple[Any, Record]:
             state, block = carry
             new = body_fun(state)
             accepted = new.num_accepted_steps > state.num_accepted_steps
-            number = jnp.where(accepted, new.num_accepted_steps, 0)
+            number = jnp.where(accepted, new.num_accepted_steps, 0).astype(jnp.int32)
             i = unvmap_max(state.num_steps) % record.block
             return new, block.including(i, state.tprev, state.tnext, number, state.y)
 

@@ -209,7 +209,7 @@ class _Backwards(eqx.Module):
         return lax.while_loop(lambda carry: carry[0] > 0, through_step, start)[1]
 
     def _through_step(self, gradient: _Gradient, block: _Block, bars: Y, i: IntScalar) -> _Gradient:
-        number = block.numbers[i]
+        number = block.numbers[i].astype(self.num_accepted.dtype)
         live = number > 0
         at = lambda tree: jtu.tree_map(lambda x: x[i], tree)
 

@@ -36,12 +36,12 @@ class StepReplayAdjoint(dfx.AbstractAdjoint):
 
     **Arguments:**
 
-    - `checkpoints`: the largest number of states to record, by default `max_steps / 8` for
-        small states (arrays of up to 64 bytes) and about `sqrt(max_steps)` for others. Every
+    - `checkpoints`: the largest number of states to record, by default all of them for small
+        states (arrays of up to 64 bytes) and about `sqrt(max_steps)` for others. Every
         `ceil(max_steps / checkpoints)`-th state is kept, and those between two of them are
-        computed again, one more pass over the steps altogether; with `checkpoints=max_steps`
-        none, which is the fastest for one trajectory, but seldom for a batch. Memory:
-        `3 max_steps` numbers, `checkpoints` states, and the states between two of them.
+        computed again, one more pass over the steps altogether. Fewer save memory, and time in
+        a batch where `max_steps` is much more than the number of steps. Memory: `3 max_steps`
+        numbers, `checkpoints` states, and the states between two of them.
 
     Works with any solver of Diffrax or this library, adaptive or constant steps, and
     `SaveAt` with `t0`, `t1`, `ts`, `steps` and `fn`. Derivatives with respect to `y0`,

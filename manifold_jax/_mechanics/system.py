@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._custom_types import Args, RealScalarLike, Y
-from .._linear import combine, factorize, gram, gram_written_out
+from .._linear import combine, factorize, gram, gram_written_out, multiply
 from .constraint import check_mechanical_state, Kinematics, MechanicalConstraint
 from .lagrangian import LagrangianForce
 from .mass import ConfigurationMass, LagrangianMass, Mass
@@ -192,7 +192,7 @@ class _Motion:
         if self.mass.augmentation is not None:
             force = force - combine(self.mass.augmentation * bias, self.C)
         free = self.mass.solve(force)
-        multipliers = self.factorization.solve(gram_written_out(self.C, free[None, :])[:, 0] + bias)
+        multipliers = self.factorization.solve(multiply(self.C, free) + bias)
         # Added, not selected: the derivative of a discarded NaN would be NaN.
         valid = self.mass.valid & self.factorization.full_rank
         undefined = jnp.where(valid, 0, jnp.nan).astype(free.dtype)
