@@ -218,7 +218,7 @@ def main(
     steps: Annotated[int, typer.Option(min=10, help="Steps of the optimizer.")] = 10_000,
     seed: Annotated[int, typer.Option(help="Of data and network.")] = 0,
 ) -> None:
-    """Train and compare; with the default number of steps half an hour."""
+    """Train and compare; with the default number of steps forty minutes."""
     use_double_precision()
     console = make_console()
     rows, curves = [], []

@@ -100,10 +100,10 @@ slow = lambda *values: pytest.param(*values, marks=pytest.mark.slow)
     ("name", "checkpoints"),
     [
         ("subs with functions", None),
-        ("t0, every third step, t1", 200),
+        ("t0, every third step, t1", 25),
         *(slow(name, None) for name in SAVEATS if name != "subs with functions"),
         slow("t0, ts, t1", 7),
-        slow("subs with functions", 200),
+        slow("subs with functions", 14),
     ],
 )
 def test_every_way_of_saving(name, checkpoints):
