@@ -5,6 +5,7 @@ from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
+import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, Float, Int
@@ -50,11 +51,13 @@ class Record(eqx.Module):
         return self.starts.shape[1]
 
     def steps_at(self, times: Float[Array, " rows"]) -> Int[Array, " rows"]:
-        """The accepted steps in which sorted times lie."""
-        accepted = self.numbers > 0
-        # Others are of no length here: at most `t0` lies at the end of one, if it is the first.
-        ends = jnp.where(accepted, self.ends, self.starts).reshape(-1)
-        return jnp.maximum(jnp.searchsorted(ends, times).astype(int), jnp.argmax(accepted))
+        """The accepted steps in which times lie; beyond all steps where there is none."""
+        # Rejected steps end where the last accepted one did: a time at a jump lies between that
+        # one and the start of the next.
+        ends = jnp.where(self.numbers > 0, self.ends, -jnp.inf).reshape(-1)
+        used = jnp.isfinite(self.ends).reshape(-1)
+        ends = jnp.where(used, lax.cummax(ends), jnp.inf)
+        return jnp.searchsorted(ends, times).astype(int)
 
     def including(self, i: IntScalar, block: "_Recent", start: Y) -> "Record":
         put = lambda buffer, x: buffer_at_set(buffer, i, x)

@@ -36,7 +36,8 @@ class Saving(eqx.Module):
 class Replay(eqx.Module):
     """A solve as functions of single steps. What they close over are their leaves."""
 
-    step: Callable  # (start, end, y) -> next state, what each of the savings keeps of it
+    # (start, end, y, times) -> next state, what each of the savings keeps of it, at its time
+    step: Callable
     savings: list[Saving]
 
     @staticmethod
@@ -55,9 +56,10 @@ class Replay(eqx.Module):
             y1, _, dense_info, _, _ = solver.step(terms, start, end, y, args, state, False)
             return y1, dense_info
 
-        def step(start, end, y):
+        def step(start, end, y, times):
             y1, _ = attempt(start, end, y)
-            return y1, [sub.fn(end, y1, args) if sub.steps else None for sub in subs]
+            saved = zip(subs, times, strict=True)
+            return y1, [sub.fn(t, y1, args) if sub.steps else None for sub, t in saved]
 
         def saving(sub: dfx.SubSaveAt) -> Saving:
             def in_step(t, start, end, y):
@@ -72,7 +74,8 @@ class Replay(eqx.Module):
             at_end = sub.t1 and sub.steps != 1  # with every step the last row is one of those
             return Saving(int(sub.t0), num_times, sub.steps, at_end, at_state, between)
 
-        return Replay(eqx.filter_closure_convert(step, t, t, y), [saving(sub) for sub in subs])
+        step = eqx.filter_closure_convert(step, t, t, y, [t] * len(subs))
+        return Replay(step, [saving(sub) for sub in subs])
 
 
 class Rows(NamedTuple):
@@ -125,7 +128,8 @@ def replay_backwards(
         return i - 1, back.through_block(gradient, back.block(i - 1), total)
 
     _, gradient = lax.while_loop(lambda carry: carry[0] > 0, through_block, (num_blocks, gradient))
-    gradient = back.through_start(gradient, record.starts[0, 0], y0)
+    t0 = jnp.where(counts[0] > 0, record.starts[0, 0], last[0])  # without a step the same
+    gradient = back.through_start(gradient, t0, y0)
     return gradient.leaves, gradient.y
 
 
@@ -184,7 +188,7 @@ class _Backwards(eqx.Module):
 
         def advance(y, xs):
             start, end, live = xs
-            y1, _ = self._replay(self.leaves).step(start, end, y)
+            y1, _ = self._replay(self.leaves).step(start, end, y, [end] * len(self.rows))
             keep = lambda a, b: jnp.where(live, a, b)
             return jtu.tree_map(keep, y1, y), y
 
@@ -213,17 +217,25 @@ class _Backwards(eqx.Module):
         live = number > 0
         at = lambda tree: jtu.tree_map(lambda x: x[i], tree)
 
-        def saved_bar(saving: Saving, rows: Rows) -> Any:
+        end = block.ends[i]
+
+        def saved_bar(saving: Saving, rows: Rows) -> tuple[Any, RealScalarLike]:
             if not saving.steps:
-                return None
+                return None, end
             row = saving.offset + number // saving.steps - 1
             saved = live & (number % saving.steps == 0)
-            return jtu.tree_map(lambda b: jnp.where(saved, b[row], 0), rows.cotangents)
+            # The time that was saved is that behind a jump at which the step ended.
+            time = jnp.where(saved, rows.times[row], end)
+            return jtu.tree_map(lambda b: jnp.where(saved, b[row], 0), rows.cotangents), time
 
-        saved = [saved_bar(s, r) for s, r in zip(self.rest.savings, self.rows, strict=True)]
-        step = lambda leaves, y: self._replay(leaves).step(block.starts[i], block.ends[i], y)
+        savings = zip(self.rest.savings, self.rows, strict=True)
+        saved, times = zip(*(saved_bar(saving, rows) for saving, rows in savings), strict=True)
+
+        def step(leaves: Any, y: Y) -> tuple[Y, list[Any]]:
+            return self._replay(leaves).step(block.starts[i], end, y, list(times))
+
         _, pullback = jax.vjp(step, self.leaves, at(block.states))
-        leaves_bar, y_bar = pullback((gradient.y, saved))
+        leaves_bar, y_bar = pullback((gradient.y, list(saved)))
         return _Gradient(
             jtu.tree_map(
                 lambda new, old, b: jnp.where(live, new, old) + b, y_bar, gradient.y, at(bars)
@@ -238,7 +250,8 @@ class _Backwards(eqx.Module):
         size = block.starts.shape[0]
         row, step = jnp.arange(len(rows.times)), rows.steps
         valid = (row >= saving.offset) & (row < saving.offset + saving.num_times)
-        valid &= (row < rows.count) & (step < self.num_steps)
+        # A solve that ended early saved fewer: the row of its end follows on those.
+        valid &= (row < rows.count - int(saving.end)) & (step < self.num_steps)
         first = saving.offset + jnp.sum(valid & (step < block.first))
         count = jnp.sum(valid & (step >= block.first) & (step < block.first + size))
 

@@ -43,7 +43,7 @@ class StepReplayAdjoint(dfx.AbstractAdjoint):
         a batch where `max_steps` is much more than the number of steps. Memory: `3 max_steps`
         numbers, `checkpoints` states, and the states between two of them.
 
-    Works with any solver of Diffrax or this library, adaptive or constant steps, and
+    Works with any one-step solver of Diffrax or this library, adaptive or constant steps, and
     `SaveAt` with `t0`, `t1`, `ts`, `steps` and `fn`. Derivatives with respect to `y0`,
     `args`, and all that terms, constraints and `fn` hold or close over. Under `vmap` all
     trajectories go back with one common counter.
@@ -51,7 +51,8 @@ class StepReplayAdjoint(dfx.AbstractAdjoint):
     **Raises:**
 
     `ValueError` for what it does not support: events, `max_steps=None`, `UnsafeBrownianPath`,
-    `ts` and `steps` in one `SubSaveAt`. An error when differentiating with respect to times
+    solvers with a memory (`LeapfrogMidpoint`, `ReversibleHeun`; your own cannot be told), `ts`
+    and `steps` in one `SubSaveAt`. An error when differentiating with respect to times
     (`t0`, `t1`, `dt0`, `ts`) or through the dense solution. Use
     `diffrax.RecursiveCheckpointAdjoint()` there, which is also the better choice where a
     state is so large that `max_steps` of them do not fit into memory, and under `vmap` with
@@ -89,7 +90,7 @@ class StepReplayAdjoint(dfx.AbstractAdjoint):
         progress_meter,
     ) -> Any:
         del throw, passed_solver_state, passed_controller_state
-        _check_supported(terms, saveat, event, max_steps)
+        _check_supported(terms, solver, saveat, event, max_steps)
         solver = _twice_differentiable(solver)
         fixed = (t0, t1, dt0, stepsize_controller, init_state.tprev, init_state.tnext)
         t0, t1, dt0, stepsize_controller, tprev, tnext = _without_derivative(fixed)
@@ -190,13 +191,21 @@ def _without_derivative(tree: Any) -> Any:
     return nondifferentiable(tree, name="A time or step size, with `adjoint=StepReplayAdjoint()`,")
 
 
-def _check_supported(terms: Any, saveat: dfx.SaveAt, event: Any, max_steps: int | None) -> None:
+def _check_supported(
+    terms: Any, solver: Any, saveat: dfx.SaveAt, event: Any, max_steps: int | None
+) -> None:
     other = "use `adjoint=diffrax.RecursiveCheckpointAdjoint()`."
     if event is not None:
         raise ValueError(f"`adjoint=StepReplayAdjoint()` does not support `event`: {other}")
-    if max_steps is None:
+    if max_steps is None or max_steps < 1:
         raise ValueError(
-            "`adjoint=StepReplayAdjoint()` needs room for the steps it records: pass an integer as `max_steps`."
+            "`adjoint=StepReplayAdjoint()` needs room for the steps it records: pass a positive integer as `max_steps`."
+        )
+    inner = getattr(solver, "solver", solver)
+    if isinstance(inner, dfx.LeapfrogMidpoint | dfx.ReversibleHeun):
+        raise ValueError(
+            f"`adjoint=StepReplayAdjoint()` repeats each step from its state alone, but `{type(inner).__name__}()` "
+            f"needs what it remembers of earlier ones: {other}"
         )
     if is_unsafe_sde(terms):
         raise ValueError(

@@ -71,7 +71,8 @@ def explicit_step(
         at_stage = at_corrected
     fsal = is_first_same_as_last(tableau)
     rows = list(tableau.a_lower)
-    times = [jnp.asarray(t0 + float(c) * (t1 - t0)) for c in tableau.c]
+    # Not beyond `t1` by rounding, where the field may have jumped.
+    times = [jnp.asarray(t1 if c == 1 else t0 + float(c) * (t1 - t0)) for c in tableau.c]
     f, first = f0, terms.prod(f0, control)
     inner_rows = rows[:-1] if fsal else rows
     increment = lambda t, y: terms.prod(at_stage(t, y), control)

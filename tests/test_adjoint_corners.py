@@ -1,0 +1,100 @@
+"""Corners of `mj.StepReplayAdjoint`, where the reference is Diffrax's default on the same solve."""
+
+import diffrax as dfx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import manifold_jax as mj
+
+
+RATE = jnp.asarray(1.3)
+DECAY = dfx.ODETerm(lambda t, y, rate: -rate * y)
+Y0 = jnp.array([1.0])
+
+
+def gradients(objective):
+    adjoints = mj.StepReplayAdjoint(), dfx.RecursiveCheckpointAdjoint()
+    return [
+        jax.jit(jax.grad(lambda r, adjoint=adjoint: objective(r, adjoint)))(RATE)
+        for adjoint in adjoints
+    ]
+
+
+def same(objective, rtol=1e-12):
+    replayed, reference = gradients(objective)
+    assert abs(reference) > 1e-3
+    np.testing.assert_allclose(replayed, reference, rtol=rtol)
+
+
+def weighted(ys):
+    flat = jnp.where(jnp.isfinite(ys), ys, 0.0).reshape(-1)
+    return flat @ jnp.arange(1.0, 1 + flat.size)
+
+
+def test_a_solve_that_ends_early_saves_its_end_once():
+    saveat = dfx.SaveAt(ts=jnp.linspace(0.0, 1.0, 5), t1=True)
+
+    def objective(rate, adjoint):
+        options = dict(saveat=saveat, adjoint=adjoint, max_steps=5, throw=False)
+        sol = dfx.diffeqsolve(DECAY, dfx.Heun(), 0.0, 1.0, 0.1, Y0, rate, **options)
+        return weighted(sol.ys)
+
+    same(objective)
+
+
+def test_without_a_step_what_is_saved_is_saved_at_t0():
+    saveat = dfx.SaveAt(t0=True, fn=lambda t, y, rate: jnp.sin(rate * t) * y)
+
+    def objective(rate, adjoint):
+        options = dict(saveat=saveat, adjoint=adjoint, max_steps=5)
+        sol = dfx.diffeqsolve(DECAY, dfx.Heun(), 0.5, 0.5, 0.1, Y0, rate, **options)
+        return weighted(sol.ys)
+
+    same(objective)
+
+
+def jumping(saveat, solver, rtol, factor, t0=0.0, dt0=0.1):
+    field = lambda t, y, rate: -jnp.where(t < 0.5, 1.0, factor) * rate * y
+    steps = dfx.PIDController(rtol=rtol, atol=rtol)
+    controller = dfx.ClipStepSizeController(steps, jump_ts=jnp.array([0.5]))
+
+    def objective(rate, adjoint):
+        options = dict(saveat=saveat, adjoint=adjoint, max_steps=200)
+        options["stepsize_controller"] = controller
+        sol = dfx.diffeqsolve(dfx.ODETerm(field), solver, t0, 1.0, dt0, Y0, rate, **options)
+        return weighted(sol.ys)
+
+    return objective
+
+
+def test_a_time_saved_at_a_jump():
+    """The step behind it is rejected first."""
+    same(jumping(dfx.SaveAt(ts=jnp.array([0.5])), dfx.Tsit5(), 1e-4, 300.0))
+
+
+def test_a_function_saved_at_the_end_of_a_step_before_a_jump():
+    """Diffrax calls it with the time behind the jump."""
+    saveat = dfx.SaveAt(steps=True, fn=lambda t, y, rate: jnp.where(t < 0.5, 1.0, 100.0) * rate * y)
+    same(jumping(saveat, dfx.Heun(), 1e-3, 1.0))
+
+
+def test_stages_at_the_end_of_a_step_are_not_behind_the_jump():
+    """`t0 + 1 (t1 - t0)` may be: rounded, and the field is another one there."""
+    t0 = 0.1303105720275551
+    saveat = dfx.SaveAt(ts=jnp.array([0.5]))
+    same(jumping(saveat, dfx.Dopri5(), 10.0, 30.0, t0=t0, dt0=0.5 - t0), rtol=1e-10)
+
+
+@pytest.mark.parametrize("solver", [dfx.LeapfrogMidpoint(), dfx.ReversibleHeun()], ids=str)
+def test_solvers_with_a_memory_are_refused(solver):
+    adjoint = mj.StepReplayAdjoint()
+    with pytest.raises(ValueError, match="what it remembers"):
+        dfx.diffeqsolve(DECAY, solver, 0.0, 1.0, 0.1, Y0, RATE, adjoint=adjoint)
+
+
+def test_no_room_for_steps_is_refused():
+    adjoint = mj.StepReplayAdjoint()
+    with pytest.raises(ValueError, match="`max_steps`"):
+        dfx.diffeqsolve(DECAY, dfx.Heun(), 0.0, 1.0, 0.1, Y0, RATE, adjoint=adjoint, max_steps=0)
