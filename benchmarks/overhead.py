@@ -411,6 +411,7 @@ def main(
         many = batch_of_trajectories(problem, batch, repeats)
         points = many_saved_points(problem, repeats)
         gradient = gradients(problem, repeats)
+        jax.clear_caches()  # memory held by the programs so far slows large batches
         double = mj.problems.double_pendulum()
         accelerations = time_accelerations(double, repeats)
         solves = time_solves(double, max(1, repeats // 5))
