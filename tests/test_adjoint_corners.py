@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import manifold_jax as mj
+from manifold_jax._adjoint.record import default_stride
 
 
 RATE = jnp.asarray(1.3)
@@ -98,3 +99,9 @@ def test_no_room_for_steps_is_refused():
     adjoint = mj.StepReplayAdjoint()
     with pytest.raises(ValueError, match="`max_steps`"):
         dfx.diffeqsolve(DECAY, dfx.Heun(), 0.0, 1.0, 0.1, Y0, RATE, adjoint=adjoint, max_steps=0)
+
+
+def test_only_small_states_are_all_recorded_by_default():
+    """However small its arrays are."""
+    assert default_stride((jnp.zeros(4), jnp.zeros(4)), 4096) == 1
+    assert default_stride([jnp.zeros(2)] * 100, 4096) == 64

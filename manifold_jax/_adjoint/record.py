@@ -18,7 +18,8 @@ from .._custom_types import IntScalar, Y
 # after the other if all their arrays are, and hands them to threads if not, which takes longer
 # than a step of a small system.
 _SMALL = 512
-_FEWEST, _MOST = 8, 64
+_FEWEST, _MOST = 8, 64  # steps of a block
+_SMALL_STATE = 64  # bytes
 
 
 class Record(eqx.Module):
@@ -97,17 +98,15 @@ class _Recent(eqx.Module):
 
 
 def default_stride(y: Y, max_steps: int) -> int:
-    """Steps between two recorded states: one where states are small, hardly larger than the
-    times recorded with them; else such that memory is least."""
-    return 1 if _FEWEST * _largest_leaf(y) <= _SMALL else math.isqrt(max_steps)
+    """Steps between two recorded states: one if a state is hardly larger than what is recorded
+    with it; else such that memory is least."""
+    size = sum(leaf.nbytes for leaf in jtu.tree_leaves(y))
+    return 1 if size <= _SMALL_STATE else math.isqrt(max_steps)
 
 
 def _block_length(y: Y) -> int:
-    return max(_FEWEST, min(_MOST, _SMALL // max(_largest_leaf(y), 1)))
-
-
-def _largest_leaf(y: Y) -> int:
-    return max(leaf.nbytes for leaf in jtu.tree_leaves(y))
+    largest = max(leaf.nbytes for leaf in jtu.tree_leaves(y))
+    return max(_FEWEST, min(_MOST, _SMALL // max(largest, 1)))
 
 
 def recording(record: Record, run: Callable) -> tuple[Any, Record]:

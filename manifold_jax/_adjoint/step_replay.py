@@ -36,8 +36,8 @@ class StepReplayAdjoint(dfx.AbstractAdjoint):
 
     **Arguments:**
 
-    - `checkpoints`: the largest number of states to record, by default all of them for small
-        states (arrays of up to 64 bytes) and about `sqrt(max_steps)` for others. Every
+    - `checkpoints`: the largest number of states to record, by default all of them if a
+        state has up to 64 bytes, and about `sqrt(max_steps)` otherwise. Every
         `ceil(max_steps / checkpoints)`-th state is kept, and those between two of them are
         computed again, one more pass over the steps altogether. Fewer save memory, and time in
         a batch where `max_steps` is much more than the number of steps. Memory: `3 max_steps`

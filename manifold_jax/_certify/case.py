@@ -148,7 +148,11 @@ class Case:
 
 
 def differences(value: Callable[[np.ndarray], float], theta: np.ndarray) -> np.ndarray:
-    """Central differences of sixth order, `theta_i` changed by at most 4e-4 of its size."""
+    """Central differences of sixth order, `theta_i` changed by at most 4e-4 of its size.
+
+    Small, as charts are chosen anew along a solution: where a choice falls differently in
+    between, the discrete solution jumps by its own error.
+    """
     gradient = np.empty_like(theta)
     for i, size in enumerate(np.maximum(np.abs(theta), 0.1)):
         unit = np.eye(theta.size)[i]
