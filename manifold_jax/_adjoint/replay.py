@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 import diffrax as dfx
 import equinox as eqx
 import jax
+import jax.flatten_util as jfu
 import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
@@ -88,19 +89,20 @@ class Rows(NamedTuple):
     cotangents: Any  # leading axis: rows
 
 
-class _Block(NamedTuple):
-    """Consecutive steps, the first of which is number `first`."""
+class _Steps(NamedTuple):
+    """One step, or with a leading axis several."""
 
-    first: IntScalar
-    starts: Float[Array, " steps"]
-    ends: Float[Array, " steps"]
-    numbers: Int[Array, " steps"]  # among the accepted ones, from 1; 0 for others
-    states: Y  # leading axis: steps
+    starts: Float[Array, "*steps"]
+    ends: Float[Array, "*steps"]
+    accepted: Bool[Array, "*steps"]
+    states: Y  # from which they were made
 
 
 class _Gradient(NamedTuple):
-    """With respect to the current state, and to the leaves of the functions so far."""
+    """With respect to the state behind accepted step `number`, and to the leaves of the functions
+    so far."""
 
+    number: IntScalar
     y: Y
     leaves: Any
 
@@ -117,18 +119,19 @@ def replay_backwards(
     """Gradients with respect to the leaves of `replay` and to `y0`. `counts` are the numbers of
     all steps and of the accepted ones."""
     leaves, rest = eqx.partition(replay, perturbed)
-    back = _Backwards(leaves, rest, record, *counts, rows)
-    gradient = _Gradient(*jtu.tree_map(jnp.zeros_like, (y0, leaves)))
+    _, unravel = jfu.ravel_pytree(y0)
+    back = _Backwards(leaves, rest, record, unravel, *counts, rows)
+    gradient = _Gradient(counts[1], *jtu.tree_map(jnp.zeros_like, (y0, leaves)))
     gradient = back.through_end(gradient, *last)
     total = unvmap_max(counts[0])
     num_blocks = -(-total // record.block)
 
     def through_block(carry):
         i, gradient = carry
-        return i - 1, back.through_block(gradient, back.block(i - 1), total)
+        return i - 1, back.through_block(gradient, i - 1, total)
 
     _, gradient = lax.while_loop(lambda carry: carry[0] > 0, through_block, (num_blocks, gradient))
-    t0 = jnp.where(counts[0] > 0, record.starts[0, 0], last[0])  # without a step the same
+    t0 = jnp.where(counts[0] > 0, record.steps[0, 0, 0], last[0])  # without a step the same
     gradient = back.through_start(gradient, t0, y0)
     return gradient.leaves, gradient.y
 
@@ -137,6 +140,7 @@ class _Backwards(eqx.Module):
     leaves: Any
     rest: Any
     record: Record
+    unravel: Callable
     num_steps: IntScalar
     num_accepted: IntScalar
     rows: list[Rows]
@@ -169,122 +173,121 @@ class _Backwards(eqx.Module):
         _, pullback = jax.vjp(value, self.leaves, y)
         leaves_bar, y_bar = pullback(bar)
         add = lambda a, b: jtu.tree_map(jnp.add, a, b)
-        return _Gradient(add(gradient.y, y_bar), add(gradient.leaves, leaves_bar))
+        return gradient._replace(y=add(gradient.y, y_bar), leaves=add(gradient.leaves, leaves_bar))
 
     def _replay(self, leaves: Any) -> Replay:
         return eqx.combine(leaves, self.rest)
 
-    def block(self, i: IntScalar) -> _Block:
+    def _steps_of_block(self, i: IntScalar) -> _Steps:
         record = self.record
+        accepted = record.steps[i, :, 2] > 0
         # Rows of no accepted step hold the first one: functions may refuse what is not a state
         # or time.
-        live = record.numbers[i] > 0
-        used = lambda x: jnp.where(live.reshape(live.shape + (1,) * (x.ndim - 2)), x[i], x[0, 0])
-        starts, ends = used(record.starts), used(record.ends)
-        first = i * record.block
+        used = lambda x: jnp.where(accepted[:, None], x[i], x[0, 0])
+        starts, ends, _ = jnp.moveaxis(used(record.steps), 1, 0)
         if record.every_state:
-            states = jtu.tree_map(used, record.states)
-            return _Block(first, starts, ends, record.numbers[i], states)
+            return _Steps(starts, ends, accepted, jax.vmap(self.unravel)(used(record.states)))
 
         def advance(y, xs):
-            start, end, live = xs
+            start, end, accepted = xs
             y1, _ = self._replay(self.leaves).step(start, end, y, [end] * len(self.rows))
-            keep = lambda a, b: jnp.where(live, a, b)
+            keep = lambda a, b: jnp.where(accepted, a, b)
             return jtu.tree_map(keep, y1, y), y
 
-        unfinished = first < self.num_steps
-        start = jtu.tree_map(lambda y: jnp.where(unfinished, y[i], y[0]), record.states)
-        _, states = lax.scan(advance, start, (starts, ends, live))
-        return _Block(first, starts, ends, record.numbers[i], states)
+        unfinished = i * record.block < self.num_steps
+        start = jnp.where(unfinished, record.states[i], record.states[0])
+        _, states = lax.scan(advance, self.unravel(start), (starts, ends, accepted))
+        return _Steps(starts, ends, accepted, states)
 
-    def through_block(self, gradient: _Gradient, block: _Block, total: IntScalar) -> _Gradient:
-        size = block.starts.shape[0]
-        bars, leaves = jtu.tree_map(jnp.zeros_like, block.states), gradient.leaves
+    def through_block(self, gradient: _Gradient, i: IntScalar, total: IntScalar) -> _Gradient:
+        first, steps = i * self.record.block, self._steps_of_block(i)
+        bars, leaves = jtu.tree_map(jnp.zeros_like, steps.states), gradient.leaves
         for k, saving in enumerate(self.rest.savings):
             if saving.num_times:
-                bars, leaves = self._interpolated(k, block, bars, leaves)
+                bars, leaves = self._interpolated(k, first, steps, bars, leaves)
+
+        # Fetched one step ahead: XLA would copy the slices into every kernel that needs them.
+        fetched = lambda i: jtu.tree_map(lambda x: x[jnp.maximum(i, 0)], (steps, bars))
 
         def through_step(carry):
-            i, gradient = carry
-            i = i - 1
-            return i, self._through_step(gradient, block, bars, i)
+            i, gradient, current = carry
+            return i - 1, self._through_step(gradient, *current), fetched(i - 1)
 
-        start = jnp.minimum(total - block.first, size), _Gradient(gradient.y, leaves)
-        return lax.while_loop(lambda carry: carry[0] > 0, through_step, start)[1]
+        last = jnp.minimum(total - first, self.record.block) - 1
+        start = last, gradient._replace(leaves=leaves), fetched(last)
+        return lax.while_loop(lambda carry: carry[0] >= 0, through_step, start)[1]
 
-    def _through_step(self, gradient: _Gradient, block: _Block, bars: Y, i: IntScalar) -> _Gradient:
-        number = block.numbers[i].astype(self.num_accepted.dtype)
-        live = number > 0
-        at = lambda tree: jtu.tree_map(lambda x: x[i], tree)
-
-        end = block.ends[i]
+    def _through_step(self, gradient: _Gradient, step: _Steps, bar: Y) -> _Gradient:
+        """`bar`: cotangent of the state before the step, of what was interpolated in it."""
+        live, number = step.accepted, gradient.number
 
         def saved_bar(saving: Saving, rows: Rows) -> tuple[Any, RealScalarLike]:
             if not saving.steps:
-                return None, end
+                return None, step.ends
             row = saving.offset + number // saving.steps - 1
             saved = live & (number % saving.steps == 0)
             # The time that was saved is that behind a jump at which the step ended.
-            time = jnp.where(saved, rows.times[row], end)
+            time = jnp.where(saved, rows.times[row], step.ends)
             return jtu.tree_map(lambda b: jnp.where(saved, b[row], 0), rows.cotangents), time
 
         savings = zip(self.rest.savings, self.rows, strict=True)
         saved, times = zip(*(saved_bar(saving, rows) for saving, rows in savings), strict=True)
 
-        def step(leaves: Any, y: Y) -> tuple[Y, list[Any]]:
-            return self._replay(leaves).step(block.starts[i], end, y, list(times))
+        def values(leaves: Any, y: Y) -> tuple[Y, list[Any]]:
+            return self._replay(leaves).step(step.starts, step.ends, y, list(times))
 
-        _, pullback = jax.vjp(step, self.leaves, at(block.states))
+        _, pullback = jax.vjp(values, self.leaves, step.states)
         leaves_bar, y_bar = pullback((gradient.y, list(saved)))
         return _Gradient(
-            jtu.tree_map(
-                lambda new, old, b: jnp.where(live, new, old) + b, y_bar, gradient.y, at(bars)
-            ),
+            jnp.where(live, number - 1, number),
+            jtu.tree_map(lambda new, old, b: jnp.where(live, new, old) + b, y_bar, gradient.y, bar),
             jtu.tree_map(lambda a, b: a + jnp.where(live, b, 0), gradient.leaves, leaves_bar),
         )
 
-    def _interpolated(self, k: int, block: _Block, bars: Y, leaves: Any) -> tuple[Y, Any]:
-        """Cotangents of the rows interpolated in this block, with respect to the states from
-        which its steps were made, and to the leaves."""
+    def _interpolated(
+        self, k: int, start: IntScalar, steps: _Steps, bars: Y, leaves: Any
+    ) -> tuple[Y, Any]:
+        """Cotangents of the rows interpolated in these steps, the first of which is number
+        `start`, with respect to the states from which they were made, and to the leaves."""
         saving, rows = self.rest.savings[k], self.rows[k]
-        size = block.starts.shape[0]
+        stop = start + steps.starts.shape[0]
         row, step = jnp.arange(len(rows.times)), rows.steps
         valid = (row >= saving.offset) & (row < saving.offset + saving.num_times)
         # A solve that ended early saved fewer: the row of its end follows on those.
         valid &= (row < rows.count - int(saving.end)) & (step < self.num_steps)
-        first = saving.offset + jnp.sum(valid & (step < block.first))
-        count = jnp.sum(valid & (step >= block.first) & (step < block.first + size))
+        first = saving.offset + jnp.sum(valid & (step < start))
+        count = jnp.sum(valid & (step >= start) & (step < stop))
 
         def chunk(carry):
             c, bars, leaves = carry
             index = c * _CHUNK + jnp.arange(min(_CHUNK, len(rows.times)))
             used = index < count
             index = jnp.where(used, first + index, first)
-            bars, leaves_bar = self._chunk(k, block, bars, index, step[index] - block.first, used)
+            bars, leaves_bar = self._chunk(k, steps, bars, index, step[index] - start, used)
             leaves = jtu.tree_map(lambda a, b: a + jnp.where(count > 0, b, 0), leaves, leaves_bar)
             return c + 1, bars, leaves
 
         num_chunks = unvmap_max(-(-count // _CHUNK))
-        start = jnp.zeros_like(num_chunks), bars, leaves
-        return lax.while_loop(lambda carry: carry[0] < num_chunks, chunk, start)[1:]
+        empty = jnp.zeros_like(num_chunks), bars, leaves
+        return lax.while_loop(lambda carry: carry[0] < num_chunks, chunk, empty)[1:]
 
     def _chunk(
         self,
         k: int,
-        block: _Block,
+        steps: _Steps,
         bars: Y,
         index: Int[Array, " chunk"],
         step: Int[Array, " chunk"],
         used: Bool[Array, " chunk"],
     ) -> tuple[Y, Any]:
         bar = jtu.tree_map(lambda b: _only(used, b[index]), self.rows[k].cotangents)
-        t, start, end = self.rows[k].times[index], block.starts[step], block.ends[step]
+        t, start, end = self.rows[k].times[index], steps.starts[step], steps.ends[step]
 
         def values(leaves, states):
             f = self._replay(leaves).savings[k].in_step
             return jax.vmap(f)(t, start, end, states)
 
-        _, pullback = jax.vjp(values, self.leaves, jtu.tree_map(lambda y: y[step], block.states))
+        _, pullback = jax.vjp(values, self.leaves, jtu.tree_map(lambda y: y[step], steps.states))
         leaves_bar, states_bar = pullback(bar)
         add = lambda b, s: b.at[step].add(_only(used, s))
         return jtu.tree_map(add, bars, states_bar), leaves_bar
