@@ -13,7 +13,7 @@ from diffrax._heuristics import (
 )
 from diffrax._integrate import (
     loop as diffrax_loop,  # what an adjoint has to run  # noqa: F401
-    SaveState,
+    SaveState as SaveState,  # what has been saved so far
 )
 from diffrax._saveat import save_y as save_y  # marks "save the state itself" in SubSaveAt.fn
 from diffrax._solution import (
@@ -25,8 +25,8 @@ from equinox.internal import (
     buffer_at_set as buffer_at_set,  # writes in place, also under vmap
     MaybeBuffer as MaybeBuffer,  # an array, or one that a loop writes to in place
     nondifferentiable as nondifferentiable,
-    nondifferentiable_backward as nondifferentiable_backward,
-    unvmap_max as unvmap_max,  # over all lanes of a batch
+    unvmap_any as unvmap_any,  # over all lanes of a batch
+    unvmap_max as unvmap_max,
     while_loop as while_loop,  # Diffrax's loops take its arguments
 )
 from jaxtyping import PyTree

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from diffrax import RESULTS
 
+from ._adjoint import LocatingAdjoint, StepReplayAdjoint
 from ._compat import is_okay, nonlinear_failure, update_result
 from ._constraint import check_constraint, check_state
 from ._custom_types import Args, RealScalarLike, Y
@@ -21,7 +22,7 @@ from ._initial import (
 )
 from ._interpolation import ManifoldInterpolation
 from ._mechanics.term import DirectedTerm
-from ._output import on_manifold_events, on_manifold_saving, project_output
+from ._output import events_in_true_time, on_manifold_saving, project_output
 from ._solver import Stabilized
 from ._solver.base import AbstractManifoldSolver
 from ._stabilization import is_stable, stability_interval
@@ -39,7 +40,7 @@ def diffeqsolve(
     *,
     saveat: dfx.SaveAt = dfx.SaveAt(t1=True),
     stepsize_controller: dfx.AbstractStepSizeController = dfx.ConstantStepSize(),
-    adjoint: dfx.AbstractAdjoint = dfx.RecursiveCheckpointAdjoint(),
+    adjoint: dfx.AbstractAdjoint = StepReplayAdjoint(),
     event: dfx.Event | None = None,
     max_steps: int | None = 4096,
     throw: bool = True,
@@ -85,6 +86,9 @@ def diffeqsolve(
 
     Source: Sudarsan & Keerthi, Appl. Math. Comput. 92 (1998) 153-193.
     """
+    _check_arguments(adjoint, consistent)
+    if event is not None and event.root_finder is not None:
+        adjoint = LocatingAdjoint(adjoint)
     options = dict(
         stepsize_controller=stepsize_controller,
         adjoint=adjoint,
@@ -100,7 +104,6 @@ def diffeqsolve(
         return dfx.diffeqsolve(
             terms, solver, t0, t1, dt0, y0, args, saveat=saveat, event=event, throw=throw, **options
         )
-    _check_arguments(adjoint, consistent)
     time_dtype = _time_dtype(t0, t1, dt0, saveat)
     y0 = _as_state(y0, time_dtype)
     t0, t1 = jnp.asarray(t0, time_dtype), jnp.asarray(t1, time_dtype)
@@ -123,7 +126,7 @@ def diffeqsolve(
         y0,
         args,
         saveat=on_manifold_saving(saveat, solver, event),
-        event=on_manifold_events(event, solver, terms, t0, t1, dt0),
+        event=events_in_true_time(event, terms, t0, t1, dt0),
         throw=False,
         **options,
     )

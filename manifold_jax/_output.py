@@ -35,48 +35,46 @@ def on_manifold_saving(
     """
 
     def wrap(sub: dfx.SubSaveAt) -> dfx.SubSaveAt:
-        interpolated = _is_interpolated(sub, event)
-        if sub.fn is save_y or not interpolated or not solver.corrects_output:
+        if sub.fn is save_y or not _is_interpolated(sub, event):
             return sub
 
         def fn(t, y, args):
             corrected, info = solver.projection(solver.constraint, t, y, args)
-            return sub.fn(t, _nan_unless(info.success, corrected), args)
+            return sub.fn(t, _nan_unless(info.success, corrected), args), info.success
 
         return eqx.tree_at(lambda s: s.fn, sub, fn)
 
-    subs = jtu.tree_map(wrap, saveat.subs, is_leaf=_is_sub)
+    subs = saveat.subs
+    if solver.corrects_output:
+        subs = jtu.tree_map(wrap, subs, is_leaf=_is_sub)
     return eqx.tree_at(
         lambda s: (s.subs, s.solver_state), saveat, (subs, True), is_leaf=lambda x: x is None
     )
 
 
-def on_manifold_events(
+def events_in_true_time(
     event: dfx.Event | None,
-    solver: AbstractManifoldSolver,
     terms: Any,
     t0: Any,
     t1: Any,
     dt0: Any,
 ) -> dfx.Event | None:
-    """Events that see corrected states and the true time.
+    """Events that see the true time.
 
     Diffrax hands an event function negated times when integrating backwards; with the
-    original terms and times it is consistent again.
+    original terms and times it is consistent again. States at the ends of steps are on the
+    manifold.
     """
     if event is None:
         return None
     direction = jnp.where(t0 < t1, 1, -1)
 
     def wrap(cond_fn: Callable) -> Callable:
-        def on_manifold(t, y, args, **kwargs):
-            t = t * direction
-            if solver.corrects_output:
-                y, _ = solver.projection(solver.constraint, t, y, args)
+        def in_true_time(t, y, args, **kwargs):
             kwargs = {**kwargs, "terms": terms, "t0": t0, "t1": t1, "dt0": dt0}
-            return cond_fn(t, y, args, **kwargs)
+            return cond_fn(t * direction, y, args, **kwargs)
 
-        return on_manifold
+        return in_true_time
 
     cond_fn = jtu.tree_map(wrap, event.cond_fn, is_leaf=callable)
     return dfx.Event(cond_fn, event.root_finder, event.direction)
@@ -98,8 +96,12 @@ def project_output(
 
     def correct(sub: dfx.SubSaveAt, ts: Array, ys: Any) -> Any:
         nonlocal failed
-        if sub.fn is not save_y or not _is_interpolated(sub, event):
+        if not _is_interpolated(sub, event):
             return ys
+        if sub.fn is not save_y:
+            values, successes = ys
+            failed |= jnp.any(jnp.isfinite(ts) & ~successes)
+            return values
         out, failures = jax.vmap(lambda t, y: _corrected(solver, t, y, y0, args))(ts, ys)
         failed |= jnp.any(failures)
         return out

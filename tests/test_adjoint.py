@@ -82,12 +82,12 @@ SAVEATS = {
     "t1": dfx.SaveAt(t1=True),
     "t0, ts, t1": dfx.SaveAt(t0=True, ts=TIMES, t1=True),
     "steps": dfx.SaveAt(steps=True),
-    "t0, every third step, t1": dfx.SaveAt(t0=True, steps=3, t1=True),
+    "t0, every third step, ts, t1": dfx.SaveAt(t0=True, steps=3, ts=TIMES, t1=True),
     "subs with functions": dfx.SaveAt(
         subs=[
             dfx.SubSaveAt(ts=TIMES, fn=lambda t, y, args: t * args + y[0] @ y[0]),
             dfx.SubSaveAt(steps=True, fn=lambda t, y, args: y[1] * y[0][0] * args),
-            dfx.SubSaveAt(t0=True, t1=True),
+            dfx.SubSaveAt(t0=True, t1=True, fn=lambda t, y, args: (y[0], None)),
         ]
     ),
 }
@@ -100,7 +100,7 @@ slow = lambda *values: pytest.param(*values, marks=pytest.mark.slow)
     ("name", "checkpoints"),
     [
         ("subs with functions", None),
-        ("t0, every third step, t1", 25),
+        ("t0, every third step, ts, t1", 25),
         *(slow(name, None) for name in SAVEATS if name != "subs with functions"),
         slow("t0, ts, t1", 7),
         slow("subs with functions", 14),
@@ -240,7 +240,7 @@ def test_the_record_of_a_batch_is_written_in_slices():
     batch = jnp.stack([THETA, THETA, THETA])
     program = jax.jit(jax.vmap(gradient)).lower(batch).compile().as_text()
     # Trajectories, blocks, steps, columns.
-    written = re.findall(r"\[3,13,16,\d\]\S* ([\w-]+)\(", program)
+    written = re.findall(r"\[3,26,8,\d\]\S* ([\w-]+)\(", program)
     assert "dynamic-update-slice" in written
     assert "scatter" not in written
 
@@ -274,7 +274,9 @@ def test_one_counter_for_the_whole_batch():
         for f in (value, jax.grad(value))
     )
     counters = [x.shape for x in both[len(solve) :] if jnp.issubdtype(x.dtype, jnp.integer)]
-    assert counters == [(), (), ()]  # of blocks, interpolated values and steps
+    segments_blocks_steps, rows = counters[:3], counters[3:]
+    assert segments_blocks_steps == [(), (), ()]
+    assert rows == [(2,)]  # interpolated values of one step: each trajectory its own
 
 
 def first_carried(loop):
@@ -342,82 +344,82 @@ def test_stochastic():
     np.testing.assert_allclose(reverse, jax.jacfwd(end)(1.0, dfx.ForwardMode()), rtol=1e-11)
 
 
-def refused(match, error=ValueError, adjoint=None, **options):
+def released(theta, t0=0.0, t1=1.0, **options):
+    """A pendulum of gravity `theta`, in large constant steps unless they are given."""
     problem = mj.problems.pendulum()
-    arguments = dict(saveat=dfx.SaveAt(t1=True), max_steps=100)
-    with pytest.raises(error, match=match):
-        mj.diffeqsolve(
-            problem.terms,
-            mj.Projected(dfx.Tsit5(), problem.constraint),
-            0.0,
-            1.0,
-            0.1,
-            problem.y0,
-            problem.args,
-            adjoint=mj.StepReplayAdjoint() if adjoint is None else adjoint,
-            **(arguments | options),
-        )
+    return mj.diffeqsolve(
+        problem.terms,
+        mj.Projected(dfx.Tsit5(), problem.constraint),
+        t0,
+        t1,
+        options.pop("dt0", 0.1),
+        problem.y0,
+        problem.args._replace(gravity=theta),
+        **options,
+    )
 
 
 def test_refusals():
-    refused("`event`", event=dfx.Event(lambda t, y, args, **kw: y[0][0]))
-    refused("`max_steps`", max_steps=None)
-    both = dfx.SaveAt(ts=jnp.array([0.5]), steps=True)
-    refused("`ts` and `steps`", saveat=both)
     with pytest.raises(ValueError, match="`checkpoints`"):
         mj.StepReplayAdjoint(checkpoints=0)
+    end = lambda dt0: released(9.81, dt0=dt0).ys[0][0, 0]
+    with pytest.raises(RuntimeError, match="`dt0`"):
+        jax.grad(end)(0.1)
+    unbounded = lambda g: released(g, max_steps=None).ys[0][0, 0]
+    assert np.isfinite(unbounded(9.81))
+    with pytest.raises(RuntimeError, match="`max_steps`"):
+        jax.grad(unbounded)(9.81)
 
 
-def test_times_are_not_differentiated_silently():
-    problem = mj.problems.pendulum()
+def test_times():
+    """Of the ends and of what is saved; the steps between stay where they are."""
+    saveat = lambda t: dfx.SaveAt(ts=t[None], t1=True, fn=lambda t, y, args: t * y[0][0])
 
-    def end(t1, saveat):
+    def values(times):
+        t0, t, t1 = times
+        sol = released(9.81, t0, t1, dt0=0.01, saveat=saveat(t))
+        return jnp.concatenate([sol.ys, sol.ts**2])
+
+    at_ts, at_t1, ts, t1 = jax.jit(jax.jacrev(values))(jnp.array([0.2, 0.5, 1.0]))
+    sol = released(9.81, 0.2, 1.0, dt0=0.01, saveat=dfx.SaveAt(ts=jnp.array([0.5, 1.0])))
+    (x, v), t = (a[:, 0] for a in sol.ys), sol.ts
+    # The field does not depend on time: later starts are the same motion later.
+    np.testing.assert_allclose(at_ts, [-t[0] * v[0], x[0] + t[0] * v[0], 0], atol=1e-6)
+    np.testing.assert_allclose(at_t1, [-t[1] * v[1], 0, x[1] + t[1] * v[1]], atol=1e-6)
+    np.testing.assert_allclose((ts, t1), [[0, 1, 0], [0, 0, 2]], atol=1e-12)
+
+
+def test_dense_solution_and_solver_state():
+    """Of a solve that goes on where another ended."""
+
+    def value(gravity, adjoint):
+        kept = dfx.SaveAt(t1=True, dense=True, solver_state=True)
+        options = dict(adjoint=adjoint, max_steps=20)
+        first = released(gravity, saveat=kept, **options)
+        problem = mj.problems.pendulum()
         sol = mj.diffeqsolve(
             problem.terms,
             mj.Projected(dfx.Tsit5(), problem.constraint),
-            0.0,
-            t1,
+            1.0,
+            1.5,
             0.1,
-            problem.y0,
-            problem.args,
-            saveat=saveat,
-            adjoint=mj.StepReplayAdjoint(),
+            jax.tree.map(lambda y: y[-1], first.ys),
+            problem.args._replace(gravity=gravity),
+            solver_state=first.solver_state,
+            consistent="assume",
+            **options,
         )
-        return sol.ys[0][0, 0]
+        return first.evaluate(0.43)[1] @ jnp.array([1.0, 2.0]) + sol.ys[0][0, 0]
 
-    with pytest.raises(RuntimeError, match="time or step size"):
-        jax.grad(lambda t1: end(t1, dfx.SaveAt(t1=True)))(1.0)
-    with pytest.raises(RuntimeError, match="time or step size"):
-        jax.grad(lambda t: end(1.0, dfx.SaveAt(ts=t[None])))(jnp.asarray(0.5))
+    reverse = jax.jit(jax.grad(lambda g: value(g, mj.StepReplayAdjoint())))(9.81)
+    forward = jax.jit(jax.jacfwd(lambda g: value(g, dfx.ForwardMode())))(9.81)
+    np.testing.assert_allclose(reverse, forward, rtol=1e-12)
 
 
 def test_forward_mode_is_refused():
     case = (mj.Projected, SAVEATS["t1"], dfx.Tsit5())
     with pytest.raises(TypeError, match="custom_vjp"):
         jax.jacfwd(lambda theta: loss(theta, mj.StepReplayAdjoint(), *case))(THETA)
-
-
-def test_dense_solution_is_not_differentiated_silently():
-    problem = mj.problems.pendulum()
-
-    def value(gravity):
-        sol = mj.diffeqsolve(
-            problem.terms,
-            mj.Projected(dfx.Tsit5(), problem.constraint),
-            0.0,
-            1.0,
-            0.1,
-            problem.y0,
-            problem.args._replace(gravity=gravity),
-            saveat=dfx.SaveAt(dense=True),
-            max_steps=20,
-            adjoint=mj.StepReplayAdjoint(),
-        )
-        return sol.evaluate(0.5)[0][0]
-
-    assert np.isfinite(value(9.81))
-    with pytest.raises(RuntimeError, match="dense solution"):
-        jax.grad(value)(9.81)
 
 
 def test_steps_across_jumps_of_the_field():

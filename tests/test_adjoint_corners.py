@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 import manifold_jax as mj
-from manifold_jax._adjoint.record import default_stride
 
 
 RATE = jnp.asarray(1.3)
@@ -89,19 +88,35 @@ def test_stages_at_the_end_of_a_step_are_not_behind_the_jump():
 
 
 @pytest.mark.parametrize("solver", [dfx.LeapfrogMidpoint(), dfx.ReversibleHeun()], ids=str)
-def test_solvers_with_a_memory_are_refused(solver):
+@pytest.mark.parametrize("checkpoints", [None, 4], ids=["all states", "some states"])
+def test_what_solvers_remember_is_part_of_the_state(solver, checkpoints):
+    def objective(rate, adjoint):
+        if isinstance(adjoint, mj.StepReplayAdjoint):
+            adjoint = mj.StepReplayAdjoint(checkpoints)
+        options = dict(saveat=dfx.SaveAt(ts=jnp.linspace(0.0, 1.0, 5)), adjoint=adjoint)
+        sol = dfx.diffeqsolve(DECAY, solver, 0.0, 1.0, 0.05, Y0, rate, max_steps=30, **options)
+        return weighted(sol.ys)
+
+    same(objective)
+
+
+def test_a_time_dependent_constraint_with_times():
+    """The correction of what is saved depends on the times that are handed out."""
+    growing = mj.Constraint(lambda t, y, rate: y @ y - (1 + t) ** rate)
+    field = dfx.ODETerm(lambda t, y, rate: rate / 2 / (1 + t) * y + jnp.stack([-y[1], y[0]]))
+
+    def objective(rate, adjoint):
+        solver = mj.Projected(dfx.Heun(), growing)
+        options = dict(saveat=dfx.SaveAt(ts=jnp.linspace(0.0, 1.0, 5)), adjoint=adjoint)
+        y0 = jnp.array([1.0, 0.0])
+        sol = mj.diffeqsolve(field, solver, 0.0, 1.0, 0.1, y0, rate, max_steps=20, **options)
+        return weighted(sol.ys)
+
+    same(objective)
+
+
+def test_no_room_for_steps():
     adjoint = mj.StepReplayAdjoint()
-    with pytest.raises(ValueError, match="what it remembers"):
-        dfx.diffeqsolve(DECAY, solver, 0.0, 1.0, 0.1, Y0, RATE, adjoint=adjoint)
-
-
-def test_no_room_for_steps_is_refused():
-    adjoint = mj.StepReplayAdjoint()
-    with pytest.raises(ValueError, match="`max_steps`"):
-        dfx.diffeqsolve(DECAY, dfx.Heun(), 0.0, 1.0, 0.1, Y0, RATE, adjoint=adjoint, max_steps=0)
-
-
-def test_only_small_states_are_all_recorded_by_default():
-    """However small its arrays are."""
-    assert default_stride((jnp.zeros(4), jnp.zeros(4)), 4096) == 1
-    assert default_stride([jnp.zeros(2)] * 100, 4096) == 64
+    options = dict(adjoint=adjoint, max_steps=0, throw=False)
+    end = lambda y0: dfx.diffeqsolve(DECAY, dfx.Heun(), 0.0, 1.0, 0.1, y0, RATE, **options).ys[0, 0]
+    assert jax.grad(end)(Y0) == 1

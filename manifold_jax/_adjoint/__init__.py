@@ -1,1 +1,2 @@
+from .events import LocatingAdjoint as LocatingAdjoint
 from .step_replay import StepReplayAdjoint as StepReplayAdjoint

@@ -1,138 +1,193 @@
-"""A loop that records its steps while it runs."""
+"""What a solve leaves behind for its way back: when each step was made, and from which state."""
 
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
-import jax.flatten_util as jfu
+import jax
 import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
 from .._compat import buffer_at_set, MaybeBuffer, unvmap_max, while_loop
-from .._custom_types import IntScalar, Y
+from .._custom_types import IntScalar
 
 
-# Bytes up to which XLA for CPUs takes an array to be small. It runs the operations of a loop one
-# after the other if all their arrays are, and hands them to threads if not, which takes longer
-# than a step of a small system.
-_SMALL = 512
-_FEWEST, _MOST = 8, 64  # steps of a block
-_SMALL_STATE = 64  # bytes
+Vectors = dict[str, Any]  # of each type of number one, also buffers of such
+
+# States that are all kept: as many as fit into this, and not more than a batch has use for, as
+# memory that is not in a cache takes longer to fill than a small state to compute again.
+_BYTES, _STATES = 2**20, 512
+
+
+class Packing(eqx.Module):
+    """A pytree of arrays as one vector for each type of number, and back."""
+
+    leaves: list[jax.ShapeDtypeStruct] = eqx.field(static=True)
+    structure: Any = eqx.field(static=True)
+
+    @staticmethod
+    def of(tree: Any) -> "Packing":
+        leaves, structure = jtu.tree_flatten(jax.eval_shape(lambda: tree))
+        return Packing(leaves, structure)
+
+    def pack(self, tree: Any) -> Vectors:
+        groups: dict[str, list[Array]] = {}
+        for leaf, like in zip(jtu.tree_leaves(tree), self.leaves, strict=True):
+            groups.setdefault(str(like.dtype), []).append(jnp.ravel(jnp.asarray(leaf, like.dtype)))
+        return {dtype: jnp.concatenate(group) for dtype, group in groups.items()}
+
+    def unpack(self, vectors: Vectors) -> Any:
+        position = dict.fromkeys(vectors, 0)
+        leaves = []
+        for like in self.leaves:
+            dtype = str(like.dtype)
+            part = lax.dynamic_slice_in_dim(vectors[dtype], position[dtype], like.size)
+            leaves.append(part.reshape(like.shape))
+            position[dtype] += like.size
+        return jtu.tree_unflatten(self.structure, leaves)
+
+    @property
+    def nbytes(self) -> int:
+        return sum(like.size * like.dtype.itemsize for like in self.leaves)
+
+
+class Block(eqx.Module):
+    """Steps one after the other. Small ones are recorded in a loop of their own: XLA for CPUs runs
+    the operations of a loop one after the other if all its arrays are small, and hands them to
+    threads if not, which may take longer than a step."""
+
+    # Columns: start, end, and 1 behind a jump if there may be jumps. The end of a rejected step
+    # and of an unused row is minus infinity.
+    times: MaybeBuffer[Float[Array, "block columns"]]
+    states: Vectors  # from which they were made; none if they are not kept
+
+    @staticmethod
+    def empty(x: Vectors, time_dtype: Any, length: int, jumps: bool, kept: bool) -> "Block":
+        times = jnp.full((length, 3 if jumps else 2), -jnp.inf, time_dtype)
+        room = lambda x: jnp.zeros((length, x.size), x.dtype)
+        return Block(times, {k: room(v) for k, v in x.items()} if kept else {})
+
+    def including(self, i: IntScalar, row: Float[Array, " columns"], x: Vectors) -> "Block":
+        states = {k: buffer_at_set(b, i, x[k]) for k, b in self.states.items()}
+        return Block(buffer_at_set(self.times, i, row), states)
 
 
 class Record(eqx.Module):
-    """The steps of a solve in blocks, rejected ones included: where each began and ended, whether
-    it was accepted, and the states from which they were made, all of them or the first of each
-    block.
+    """The steps of a solve, rejected ones included, in blocks: when each was made, and the states
+    from which they were made: all of the first few, of later ones the first of each segment,
+    which has several blocks.
 
     Rejected steps take rows so that the trajectories of a batch, which have the same number of
     steps until they end, write to the same row: an index of its own for each would make a
-    slice a scatter, which takes longer than the step. Two arrays with long rows, whatever the
-    leaves of a state, as each one that is written to costs a batch several kernels.
+    slice a scatter, which takes longer than the step.
     """
 
-    # Columns: start, end, 1 if accepted or else 0; infinity, infinity, 0 in unused rows.
-    steps: MaybeBuffer[Float[Array, "blocks block 3"]]
-    states: MaybeBuffer[Float[Array, "blocks *block n"]]
-    every_state: bool = eqx.field(static=True)
+    times: MaybeBuffer[Float[Array, "blocks block columns"]]
+    states: Vectors  # (kept blocks, block, n)
+    firsts: Vectors  # (segments, n); none if all states are kept
+    packing: Packing = eqx.field(static=True)
+    sizes: "Sizes" = eqx.field(static=True)
 
     @staticmethod
-    def empty(y: Y, time_dtype: Any, max_steps: int, stride: int) -> "Record":
-        block = min(_block_length(y), max_steps) if stride == 1 else stride
-        x, _ = jfu.ravel_pytree(y)
-        one = _Recent.empty(x, time_dtype, block, stride == 1)
-        repeat = lambda x: jnp.broadcast_to(x, (-(-max_steps // block), *x.shape))
-        states = jnp.zeros_like(x) if one.states is None else one.states
-        return Record(repeat(one.steps), repeat(states), stride == 1)
-
-    @property
-    def block(self) -> int:
-        return self.steps.shape[1]
-
-    def steps_at(self, times: Float[Array, " rows"]) -> Int[Array, " rows"]:
-        """The accepted steps in which times lie; beyond all steps where there is none."""
-        # Rejected steps end where the last accepted one did: a time at a jump lies between that
-        # one and the start of the next.
-        _, ends, accepted = jnp.moveaxis(self.steps.reshape(-1, 3), 1, 0)
-        reached = lax.cummax(jnp.where(accepted > 0, ends, -jnp.inf))
-        reached = jnp.where(jnp.isfinite(ends), reached, jnp.inf)
-        return jnp.searchsorted(reached, times).astype(int)
-
-    def including(self, i: IntScalar, block: "_Recent", start: Float[Array, " n"]) -> "Record":
-        states = block.states if self.every_state else start
+    def empty(
+        state: Any, time_dtype: Any, max_steps: int, checkpoints: int | None, jumps: bool
+    ) -> "Record":
+        packing = Packing.of(state)
+        sizes = Sizes.of(packing.nbytes, max_steps, checkpoints)
+        x = {k: jnp.zeros_like(v) for k, v in packing.pack(state).items()}
+        one = Block.empty(x, time_dtype, sizes.block, jumps, sizes.kept > 0)
+        repeat = lambda rows, x: jnp.broadcast_to(x, (rows, *x.shape))
+        segments = 0 if sizes.kept == sizes.blocks else sizes.blocks // sizes.segment
         return Record(
-            buffer_at_set(self.steps, i, block.steps),
-            buffer_at_set(self.states, i, states),
-            self.every_state,
+            repeat(sizes.blocks, one.times),
+            {k: repeat(sizes.kept, v) for k, v in one.states.items()},
+            {k: repeat(segments, v) for k, v in x.items() if segments},
+            packing,
+            sizes,
         )
 
+    @property
+    def jumps(self) -> bool:
+        return self.times.shape[2] == 3
 
-class _Recent(eqx.Module):
-    """The block that is being recorded."""
+    def new_block(self, x: Vectors) -> Block:
+        kept = self.sizes.kept > 0
+        return Block.empty(x, self.times.dtype, self.sizes.block, self.jumps, kept)
 
-    steps: MaybeBuffer[Float[Array, "block 3"]]
-    states: MaybeBuffer[Float[Array, "block n"]] | None
+    def including(self, i: IntScalar, block: Block, first: Vectors) -> "Record":
+        """With the block number `i`, whose first step was made from `first`."""
+        sizes, last = self.sizes, self.sizes.kept - 1
+        segment, begins = i // sizes.segment, i % sizes.segment == 0
+        firsts = {
+            k: buffer_at_set(b, segment, first[k], pred=begins) for k, b in self.firsts.items()
+        }
+        keep = lambda b, x: buffer_at_set(b, jnp.minimum(i, last), x, pred=i <= last)
+        states = {k: keep(b, block.states[k]) for k, b in self.states.items()}
+        times = buffer_at_set(self.times, i, block.times)
+        return Record(times, states, firsts, self.packing, sizes)
+
+
+# A block whose arrays are small, as XLA for CPUs sees them.
+_SMALL, _FEWEST = 512, 8
+# States that are all kept: as many as fit into this, and not more than a batch has use for, as
+# memory that is not in a cache takes longer to fill than a small state to compute again.
+_BYTES, _STATES = 2**20, 512
+
+
+class Sizes(NamedTuple):
+    """Steps of a block, blocks of a segment, all blocks, and those of which all states are kept."""
+
+    block: int
+    segment: int
+    blocks: int
+    kept: int
 
     @staticmethod
-    def empty(x: Float[Array, " n"], time_dtype: Any, length: int, every_state: bool) -> "_Recent":
-        unused = jnp.asarray([jnp.inf, jnp.inf, 0], time_dtype)
-        steps = jnp.broadcast_to(unused, (length, 3))
-        return _Recent(steps, jnp.zeros((length, x.size), x.dtype) if every_state else None)
-
-    def including(self, i: IntScalar, step: Float[Array, "3"], x: Float[Array, " n"]) -> "_Recent":
-        states = None if self.states is None else buffer_at_set(self.states, i, x)
-        return _Recent(buffer_at_set(self.steps, i, step), states)
-
-
-def default_stride(y: Y, max_steps: int) -> int:
-    """Steps between two recorded states: one if a state is hardly larger than what is recorded
-    with it; else such that memory is least."""
-    return 1 if _size(y) <= _SMALL_STATE else math.isqrt(max_steps)
+    def of(nbytes: int, max_steps: int, checkpoints: int | None) -> "Sizes":
+        steps = max(math.isqrt(max_steps), -(-max_steps // (checkpoints or max_steps)))
+        block = min(_FEWEST, steps) if nbytes * _FEWEST <= _SMALL else steps
+        segment = -(-steps // block)
+        segments = -(-max_steps // (segment * block))
+        if checkpoints is None:
+            checkpoints = segments + min(_STATES, _BYTES // max(nbytes, 1))
+        kept = segments if checkpoints >= max_steps else (checkpoints - segments) // (segment * block)
+        return Sizes(block, segment, segments * segment, min(kept, segments) * segment)
 
 
-def _block_length(y: Y) -> int:
-    return max(_FEWEST, min(_MOST, _SMALL // max(_size(y), 24)))
-
-
-def _size(y: Y) -> int:
-    return sum(leaf.nbytes for leaf in jtu.tree_leaves(y))
-
-
-def recording(record: Record, run: Callable) -> tuple[Any, Record]:
-    """`run(while_loop)` with `while_loop` as Diffrax's outer loop, and what it recorded."""
-    written = record
-    flat = lambda state: jfu.ravel_pytree(state.y)[0]
+def recording(record: Record, of: Callable[[Any], Any], run: Callable) -> tuple[Any, Record]:
+    """`run(while_loop)` with `while_loop` as Diffrax's outer loop, and what it recorded of
+    the states `of(loop state)`."""
+    written, block = record, record.sizes.block
+    flat = lambda state: record.packing.pack(of(state))
 
     def loop(cond_fun, body_fun, init_val, *, max_steps, buffers):
         nonlocal written
 
-        def goes_on(carry):
-            state, _ = carry
-            return cond_fun(state) & (state.num_steps < max_steps)
-
         def step(carry):
-            state, block = carry
+            state, recent = carry
             new = body_fun(state)
             accepted = new.num_accepted_steps > state.num_accepted_steps
-            row = jnp.stack([state.tprev, state.tnext, accepted.astype(state.tprev.dtype)])
-            i = unvmap_max(state.num_steps) % record.block
-            return new, block.including(i, row, flat(state))
+            row = [state.tprev, jnp.where(accepted, state.tnext, -jnp.inf)]
+            if record.jumps:
+                row.append(jnp.asarray(state.made_jump, state.tprev.dtype))
+            i = unvmap_max(state.num_steps) % block
+            return new, recent.including(i, jnp.stack(row), flat(state))
 
         def through_block(carry):
             state, record = carry
-            i, start = unvmap_max(state.num_steps) // record.block, flat(state)
-            empty = _Recent.empty(start, state.tprev.dtype, record.block, record.every_state)
-            state, block = nested(step, (state, empty), record.block)
-            return state, record.including(i, block, start)
+            i, first = unvmap_max(state.num_steps) // block, flat(state)
+            state, recent = nested(step, (state, record.new_block(first)), block)
+            return state, record.including(i, recent, first)
 
         def nested(body, carry, most):
             both = lambda carry: buffers(carry[0]) + jtu.tree_leaves(carry[1])
+            goes_on = lambda carry: cond_fun(carry[0]) & (carry[0].num_steps < max_steps)
             return while_loop(goes_on, body, carry, max_steps=most, buffers=both, kind="lax")
 
-        final, written = nested(through_block, (init_val, record), record.steps.shape[0])
+        final, written = nested(through_block, (init_val, record), record.sizes.blocks)
         return final
 
     out = run(loop)

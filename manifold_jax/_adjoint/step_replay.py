@@ -1,6 +1,6 @@
 """Reverse mode that goes back through the recorded steps, each computed once more."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import diffrax as dfx
 import equinox as eqx
@@ -11,12 +11,12 @@ from .._compat import (
     diffrax_loop,
     is_unsafe_sde,
     nondifferentiable,
-    nondifferentiable_backward,
     save_states,
     while_loop,
 )
-from .record import default_stride, Record, recording
-from .replay import Replay, replay_backwards, Rows
+from .backwards import Backwards, DenseBars, Ends, Rows, TimesBar
+from .record import Record, recording
+from .replay import memory_of, Replay, Solve, State, with_memory
 
 
 class StepReplayAdjoint(dfx.AbstractAdjoint):
@@ -90,24 +90,19 @@ class StepReplayAdjoint(dfx.AbstractAdjoint):
         progress_meter,
     ) -> Any:
         del throw, passed_solver_state, passed_controller_state
-        _check_supported(terms, solver, saveat, event, max_steps)
-        solver = _twice_differentiable(solver)
-        fixed = (t0, t1, dt0, stepsize_controller, init_state.tprev, init_state.tnext)
-        t0, t1, dt0, stepsize_controller, tprev, tnext = _without_derivative(fixed)
-        saveat = eqx.tree_at(_saved_times, saveat, replace_fn=_without_derivative)
-        init_state = eqx.tree_at(lambda s: (s.tprev, s.tnext), init_state, (tprev, tnext))
-        y0 = init_state.y
-        checkpoints = self.checkpoints
-        stride = (
-            default_stride(y0, max_steps) if checkpoints is None else -(-max_steps // checkpoints)
-        )
-        record = Record.empty(y0, tprev.dtype, max_steps, stride)
+        if is_unsafe_sde(terms):
+            raise ValueError(
+                "`adjoint=StepReplayAdjoint()` cannot repeat the steps of an `UnsafeBrownianPath`. Use a "
+                "`VirtualBrownianTree`, or `adjoint=diffrax.ForwardMode()`."
+            )
+        times = t0, t1, [sub.ts for sub in _subs(saveat)]
+        dt0 = nondifferentiable(dt0, msg=_NO_STEP_SIZES)
 
-        def forward(record):
-            run = lambda outer: diffrax_loop(
-                solver=solver,
+        def run(outer_while_loop):
+            return diffrax_loop(
+                solver=_with_loops(solver, "lax"),
                 stepsize_controller=stepsize_controller,
-                event=None,
+                event=event,
                 saveat=saveat,
                 t0=t0,
                 t1=t1,
@@ -116,105 +111,157 @@ class StepReplayAdjoint(dfx.AbstractAdjoint):
                 terms=terms,
                 args=args,
                 init_state=init_state,
-                inner_while_loop=lambda *a, checkpoints, **kw: while_loop(*a, kind="lax", **kw),
-                outer_while_loop=outer,
+                inner_while_loop=_while_loop,
+                outer_while_loop=outer_while_loop,
                 progress_meter=progress_meter,
             )
-            return recording(record, run)
 
-        replay = Replay.build(terms, solver, args, saveat, t0, y0)
+        twice = _with_loops(solver, "bounded")
+        solve = Solve.of(terms, twice, args, init_state, stepsize_controller)
+        start, interpolates = solve.state(init_state), saveat.dense or event is not None
+        replay = Replay.build(solve, saveat, t0, start, interpolates)
+        record = None
+        if max_steps is not None:
+            room = max(max_steps, 1), self.checkpoints
+            record = Record.empty(start, init_state.tprev.dtype, *room, solve.jumps)
+
+        def forward(record):
+            if record is None:
+                return run(_while_loop), None
+            return recording(record, solve.state, run)
+
         # What the functions close over becomes their leaves, which have derivatives.
         forward = eqx.filter_closure_convert(forward, record)
-        (final_state, statistics), ys = _solve((replay, y0, forward), record)
-        final_state = nondifferentiable_backward(final_state, msg=_ONLY_SAVED)
-        saved = save_states(final_state)
-        saved = [eqx.tree_at(lambda s: s.ys, s, y) for s, y in zip(saved, ys, strict=True)]
-        return eqx.tree_at(save_states, final_state, saved), statistics
+        differentiable = replay, start, times, forward
+        (final_state, statistics), handed_out = _solve(differentiable, record, solve.remembers)
+        return handed_out.put_into(final_state), statistics
 
 
-_ONLY_SAVED = (
-    "With `adjoint=StepReplayAdjoint()` only saved values `sol.ys` have derivatives, not the dense solution, statistics "
-    "or solver states. Save with `SaveAt(ts=...)`, or use `adjoint=diffrax.RecursiveCheckpointAdjoint()`."
+_NO_STEP_SIZES = (
+    "`dt0` has no derivative with `adjoint=StepReplayAdjoint()`, the default: what a solution depends on step sizes is "
+    "its error. Pass `jax.lax.stop_gradient(dt0)`."
+)
+_UNBOUNDED = (
+    "`max_steps` is None, but reverse mode needs room for the steps it records: pass a positive integer, or "
+    "`adjoint=diffrax.ForwardMode()`."
 )
 
 
+def _while_loop(*args: Any, checkpoints: Any = None, **kwargs: Any) -> Any:
+    return while_loop(*args, kind="lax", **kwargs)
+
+
+class HandedOut(NamedTuple):
+    """What has derivatives of the final state of a loop: not its statistics, and not the state of
+    the step size controller."""
+
+    ts: list[Any]
+    ys: list[Any]
+    dense_ts: Any
+    dense_infos: Any
+    event_dense_info: Any
+    state: State
+
+    @staticmethod
+    def of(final_state: Any, remembers: bool) -> "HandedOut":
+        saved = save_states(final_state)
+        memory = memory_of(final_state.solver_state) if remembers else None
+        return HandedOut(
+            [s.ts for s in saved],
+            [s.ys for s in saved],
+            final_state.dense_ts,
+            final_state.dense_infos,
+            final_state.event_dense_info,
+            State(final_state.y, memory),
+        )
+
+    def put_into(self, final_state: Any) -> Any:
+        put = lambda s, *new: eqx.tree_at(lambda s: (s.ts, s.ys), s, new, is_leaf=_is_none)
+        saved = zip(save_states(final_state), self.ts, self.ys, strict=True)
+        final_state = eqx.tree_at(save_states, final_state, [put(*of) for of in saved])
+        parts = lambda s: (s.dense_ts, s.dense_infos, s.event_dense_info, s.y)
+        new = self.dense_ts, self.dense_infos, self.event_dense_info, self.state.y
+        final_state = eqx.tree_at(parts, final_state, new, is_leaf=_is_none)
+        if self.state.memory is None:
+            return final_state
+        solver_state = with_memory(final_state.solver_state, self.state.memory)
+        return eqx.tree_at(lambda s: s.solver_state, final_state, solver_state, is_leaf=_is_none)
+
+
 @eqx.filter_custom_vjp
-def _solve(differentiable, record):
-    _, _, forward = differentiable
-    (final_state, statistics), _ = forward(record)
-    return (final_state, statistics), [s.ys for s in save_states(final_state)]
+def _solve(differentiable, record, remembers):
+    *_, forward = differentiable
+    out, _ = forward(record)
+    return out, HandedOut.of(out[0], remembers)
 
 
 @_solve.def_fwd
-def _forward(perturbed, differentiable, record):
+def _forward(perturbed, differentiable, record, remembers):
     del perturbed
-    _, _, forward = differentiable
-    (final_state, statistics), record = forward(record)
-    saved = save_states(final_state)
-    last = final_state.tprev, final_state.y
-    counts = final_state.num_steps, final_state.num_accepted_steps
-    residuals = record, counts, last, saved
-    return ((final_state, statistics), [s.ys for s in saved]), residuals
+    *_, forward = differentiable
+    out, record = forward(record)
+    state, _ = out
+    handed_out = HandedOut.of(state, remembers)
+    counts = [(s.ts, s.saveat_ts_index) for s in save_states(state)]
+    last = state.tprev, state.num_steps, state.num_accepted_steps, state.y
+    return (out, handed_out), (record, last, counts, handed_out)
 
 
 @_solve.def_bwd
-def _backward(residuals, cotangents, perturbed, differentiable, record):
-    del record
-    record, counts, last, saved = residuals
-    replay, y0, forward = differentiable
-    _, ys_bar = cotangents
+def _backward(residuals, cotangents, perturbed, differentiable, record, remembers):
+    if record is None:
+        raise RuntimeError(_UNBOUNDED)
+    record, last, counts, handed_out = residuals
+    replay, start, (t0, t1, ts), forward = differentiable
+    _, bar = cotangents
+    none_if_zero = lambda tree: tree if jtu.tree_leaves(tree) else None
+    dense = none_if_zero(bar.dense_infos), none_if_zero(bar.event_dense_info)
+    bar = jtu.tree_map(
+        lambda x, b: jnp.zeros_like(x) if b is None else b,
+        eqx.filter(handed_out, eqx.is_inexact_array),
+        bar,
+    )
+    ends = Ends(t0, t1, *last)
+    rows = []
+    for saving, (times, count), ts_bar, ys_bar in zip(
+        replay.savings, counts, bar.ts, bar.ys, strict=True
+    ):
+        count = saving.offset + count
+        if saving.steps:
+            count += ends.num_accepted // saving.steps
+        rows.append(Rows(times, count, ts_bar, ys_bar))
+    leaves, rest = eqx.partition(replay, perturbed[0])
+    back = Backwards(
+        leaves,
+        rest,
+        record,
+        start,
+        ends,
+        rows,
+        DenseBars(
+            None if dense[0] is None else bar.dense_infos,
+            None if dense[1] is None else bar.event_dense_info,
+        ),
+    )
+    gradient = back.run(bar.state, timed=any(jtu.tree_leaves(perturbed[2])))
+    times = gradient.times or TimesBar(None, None, [None] * len(ts))
+    if gradient.times is not None and bar.dense_ts is not None:
+        at = lambda t: jnp.sum(jnp.where(handed_out.dense_ts == t, bar.dense_ts, 0))
+        times = times._replace(t0=times.t0 + at(t0), t1=times.t1 + at(t1))
+    return gradient.leaves, gradient.state, tuple(times), eqx.filter(forward, lambda leaf: False)
 
-    def rows(saved, bar):
-        filled = lambda b, y: jnp.zeros_like(y) if b is None else b
-        bar = jtu.tree_map(filled, bar, saved.ys, is_leaf=lambda x: x is None)
-        return Rows(saved.ts, record.steps_at(saved.ts), saved.save_index, bar)
 
-    saved = [rows(s, bar) for s, bar in zip(saved, ys_bar, strict=True)]
-    replay_bar, y0_bar = replay_backwards(replay, perturbed[0], record, counts, saved, y0, last)
-    return replay_bar, y0_bar, eqx.filter(forward, lambda leaf: False)
-
-
-def _twice_differentiable(solver: Any) -> Any:
-    """Diffrax's loop over the stages of a step is of a kind that has no derivative forwards of the
-    one backwards, unless it is told otherwise (as its own `DirectAdjoint` does)."""
+def _with_loops(solver: Any, kind: str) -> Any:
+    """Diffrax's loop over the stages of a step is of a kind that has no derivative forwards, nor
+    forwards of the one backwards, unless it is told otherwise (as its own adjoints do)."""
     if getattr(solver, "scan_kind", "none") is not None:
         return solver
-    return eqx.tree_at(lambda s: s.scan_kind, solver, "bounded", is_leaf=lambda x: x is None)
+    return eqx.tree_at(lambda s: s.scan_kind, solver, kind, is_leaf=_is_none)
 
 
-def _saved_times(saveat: dfx.SaveAt) -> list[Any]:
-    subs = jtu.tree_leaves(saveat.subs, is_leaf=lambda x: isinstance(x, dfx.SubSaveAt))
-    return [sub.ts for sub in subs if sub.ts is not None]
+def _subs(saveat: dfx.SaveAt) -> list[dfx.SubSaveAt]:
+    return jtu.tree_leaves(saveat.subs, is_leaf=lambda x: isinstance(x, dfx.SubSaveAt))
 
 
-def _without_derivative(tree: Any) -> Any:
-    return nondifferentiable(tree, name="A time or step size, with `adjoint=StepReplayAdjoint()`,")
-
-
-def _check_supported(
-    terms: Any, solver: Any, saveat: dfx.SaveAt, event: Any, max_steps: int | None
-) -> None:
-    other = "use `adjoint=diffrax.RecursiveCheckpointAdjoint()`."
-    if event is not None:
-        raise ValueError(f"`adjoint=StepReplayAdjoint()` does not support `event`: {other}")
-    if max_steps is None or max_steps < 1:
-        raise ValueError(
-            "`adjoint=StepReplayAdjoint()` needs room for the steps it records: pass a positive integer as `max_steps`."
-        )
-    inner = getattr(solver, "solver", solver)
-    if isinstance(inner, dfx.LeapfrogMidpoint | dfx.ReversibleHeun):
-        raise ValueError(
-            f"`adjoint=StepReplayAdjoint()` repeats each step from its state alone, but `{type(inner).__name__}()` "
-            f"needs what it remembers of earlier ones: {other}"
-        )
-    if is_unsafe_sde(terms):
-        raise ValueError(
-            "`adjoint=StepReplayAdjoint()` cannot repeat the steps of an `UnsafeBrownianPath`. Use a "
-            "`VirtualBrownianTree`."
-        )
-    for sub in jtu.tree_leaves(saveat.subs, is_leaf=lambda x: isinstance(x, dfx.SubSaveAt)):
-        if sub.ts is not None and sub.steps != 0:
-            raise ValueError(
-                "`saveat` has `ts` and `steps` together, which `adjoint=StepReplayAdjoint()` does not support. Write "
-                "`SaveAt(subs=[SubSaveAt(ts=...), SubSaveAt(steps=True)])`."
-            )
+def _is_none(x: Any) -> bool:
+    return x is None

@@ -1,0 +1,176 @@
+"""The time of an event, found when the solve is over: of several in one step, the first."""
+
+from typing import Any, NamedTuple
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.lax as lax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import optimistix as optx
+from diffrax import RESULTS
+from jaxtyping import Array, Bool, Float
+
+from .._compat import SaveState, time_direction, unvmap_any
+from .._custom_types import Args, BoolScalar, FloatScalar, IntScalar
+from .._solver.base import AbstractManifoldSolver
+
+
+class LocatingAdjoint(dfx.AbstractAdjoint):
+    """Another adjoint, in a solve with events that have a root finder.
+
+    Diffrax looks for the root of the first event in the order of `cond_fn` that has changed its
+    sign in the last step. Here those of all events that have are looked for, and the earliest
+    ends the solve. The derivative of its time is that of the implicit function.
+    """
+
+    adjoint: dfx.AbstractAdjoint
+
+    def loop(
+        self, *, event: Any, saveat: dfx.SaveAt, solver: Any, terms: Any, args: Args, **kwargs: Any
+    ) -> Any:
+        given = dict(saveat=saveat, solver=solver, terms=terms)
+        final_state, statistics = self.adjoint.loop(
+            event=dfx.Event(event.cond_fn, None, event.direction), args=args, **given, **kwargs
+        )
+        names = "t0", "t1", "dt0", "stepsize_controller", "max_steps"
+        given |= {name: kwargs[name] for name in names}
+        last_step = _LastStep(event, final_state, args, given)
+        located = last_step.happened & (final_state.num_steps > 0)
+        old = _Ending(final_state.event_mask, final_state.save_state, final_state.result)
+        new = lax.cond(
+            unvmap_any(located),
+            lambda: _ending(old, final_state.num_accepted_steps, last_step, located, saveat),
+            lambda: old,
+        )
+        parts = lambda s: (s.event_mask, s.save_state, s.result)
+        return eqx.tree_at(parts, final_state, tuple(new)), statistics
+
+
+class _Ending(NamedTuple):
+    """The parts of the final state that say how a solve ended."""
+
+    event_mask: Any
+    save_state: Any
+    result: RESULTS
+
+
+class _LastStep:
+    """The step in which a solve ended, and the events in it."""
+
+    def __init__(self, event: dfx.Event, final_state: Any, args: Args, given: dict[str, Any]):
+        self.args, self.given, self.root_finder = args, given, event.root_finder
+        self.events = jtu.tree_leaves(event.cond_fn, is_leaf=callable)
+        self.directions = jtu.tree_leaves(event.direction, is_leaf=lambda x: x is None)
+        self.after = [jnp.asarray(v) for v in jtu.tree_leaves(final_state.event_values)]
+        self.mask = jnp.stack(jtu.tree_leaves(final_state.event_mask))
+        self.happened = jnp.any(self.mask)
+        self.start = lax.stop_gradient(final_state.event_tprev)
+        self.end = lax.stop_gradient(final_state.event_tnext)
+        self.interpolation = given["solver"].interpolation_cls(
+            t0=self.start, t1=self.end, **final_state.event_dense_info
+        )
+
+    def first(self) -> tuple[FloatScalar, Bool[Array, " events"], RESULTS]:
+        """The time of the first event, which one it was, and whether its root was found."""
+        changed = self._changed() if len(self.events) > 1 else self.mask
+        times, results = jax.vmap(self._root)(jnp.arange(len(self.events)), changed)
+        order = jnp.where(changed, lax.stop_gradient(times), jnp.inf)
+        i = jnp.argmin(order)
+        result = jtu.tree_map(lambda x: x[i], results)
+        return times[i], jnp.arange(len(self.events)) == i, RESULTS.promote(result)
+
+    def _values(self, t: FloatScalar) -> Float[Array, " events"]:
+        """Of a condition that is true or false: how long it is until the end of the step."""
+        solver, y = self.given["solver"], self.interpolation.evaluate(t)
+        if isinstance(solver, AbstractManifoldSolver) and solver.corrects_output:
+            time = t * time_direction(self.given["terms"])
+            y, _ = solver.projection(solver.constraint, time, y, self.args)
+
+        def value(event, after):
+            if after.dtype == bool:
+                return self.end - t
+            return event(t=t, y=y, args=self.args, **self.given).astype(t.dtype)
+
+        return jnp.stack([value(*of) for of in zip(self.events, self.after, strict=True)])
+
+    def _changed(self) -> Bool[Array, " events"]:
+        """The events that have happened in this step, not only the first in their order."""
+
+        def has(before, after, direction):
+            if after.dtype == bool:
+                return after
+            before, after = jnp.sign(before), jnp.sign(after)
+            if direction is None:
+                return before != after
+            return (before <= 0) & (after > 0) if direction else (before > 0) & (after <= 0)
+
+        before = self._values(self.start)
+        each = zip(before, self.after, self.directions, strict=True)
+        return jnp.stack([has(*of) for of in each]) | self.mask
+
+    def _root(self, i: IntScalar, changed: BoolScalar) -> tuple[FloatScalar, optx.RESULTS]:
+        def value(t, _):  # its root is the end of the step if nothing is looked for
+            there = self._values(jnp.where(changed, t, self.end))[i]
+            return jnp.where(changed, there, self.end - t)
+
+        options = dict(lower=self.start, upper=self.end)
+        root = optx.root_find(
+            value, self.root_finder, self.end, options=options, throw=False
+        )
+        return root.value, root.result
+
+
+def _ending(
+    old: _Ending,
+    num_accepted: IntScalar,
+    last_step: _LastStep,
+    located: BoolScalar,
+    saveat: dfx.SaveAt,
+) -> _Ending:
+    """How the solve ends with its first event, where there is one."""
+    t, first, found = last_step.first()
+    y = last_step.interpolation.evaluate(t)
+    mask = jtu.tree_unflatten(jtu.tree_structure(old.event_mask), list(first))
+
+    def saved(sub: dfx.SubSaveAt, state: SaveState) -> SaveState:
+        value = sub.fn(t, y, last_step.args)
+        empty = jnp.inf * time_direction(last_step.given["terms"])
+        return _saved_until(sub, state, num_accepted, (t, value), (empty, jnp.inf))
+
+    is_sub = lambda x: isinstance(x, dfx.SubSaveAt)
+    save_state = jtu.tree_map(saved, saveat.subs, old.save_state, is_leaf=is_sub)
+    result = RESULTS.where(found == RESULTS.successful, old.result, found)
+    new = _Ending(mask, save_state, result)
+    return jtu.tree_map(lambda a, b: jnp.where(located, a, b), new, old)
+
+
+def _saved_until(
+    sub: dfx.SubSaveAt,
+    state: SaveState,
+    num_accepted: IntScalar,
+    end: tuple[FloatScalar, Any],
+    empty: tuple[FloatScalar, float],
+) -> SaveState:
+    """Rows before the event, and that of the event where the end is saved."""
+    t, value = end
+    num_times = 0 if sub.ts is None else jnp.sum(sub.ts <= t)
+    # Without that of the last step.
+    num_steps = (num_accepted - 1) // sub.steps if sub.steps else 0
+    ends = sub.t1 | (num_accepted % sub.steps == 0) if sub.steps else sub.t1
+    count = int(sub.t0) + num_times + num_steps
+    row = jnp.arange(len(state.ts))
+
+    def rows(old: Array, new: Any, empty: Any) -> Array:
+        spread = lambda where: where.reshape(-1, *[1] * (old.ndim - 1))
+        is_end = spread((row == count) & ends)
+        rest = jnp.where(is_end, jnp.asarray(new, old.dtype), jnp.asarray(empty, old.dtype))
+        return jnp.where(spread(row < count), old, rest)
+
+    return SaveState(
+        saveat_ts_index=jnp.asarray(num_times, jnp.result_type(state.saveat_ts_index)),
+        ts=rows(state.ts, t, empty[0]),
+        ys=jtu.tree_map(lambda old, new: rows(old, new, empty[1]), state.ys, value),
+        save_index=jnp.asarray(count + ends, jnp.result_type(state.save_index)),
+    )
