@@ -25,6 +25,7 @@ from ._mechanics.term import DirectedTerm
 from ._output import events_in_true_time, on_manifold_saving, project_output
 from ._solver import Stabilized
 from ._solver.base import AbstractManifoldSolver
+from ._solver.implicit import with_accurate_stages
 from ._stabilization import is_stable, stability_interval
 
 
@@ -60,12 +61,18 @@ def diffeqsolve(
     **Arguments:** as `diffrax.diffeqsolve`, and
 
     - `solver`: [`Projected`][] or another solver of this library. (Any other Diffrax solver
-        is passed on as it is, for comparisons.)
+        is passed on, for comparisons; implicit stages are solved to round-off there, too.)
     - `dt0`: `None` with an adaptive controller chooses the first step from the vector field
         (Hairer, Norsett & Wanner, Solving ODEs I, II.4).
     - `consistent`: what to do with `y0`. `"project"` moves it onto the manifold, `"check"`
         refuses it if it is not there (to `tolerance`), `"assume"` trusts it.
-    - `event`: event functions get the true time, also when integrating backwards.
+    - `event`: event functions get the true time, also when integrating backwards. With a root
+        finder the earliest event ends the solve, whatever the order of `cond_fn`.
+    - `adjoint`: how derivatives are computed, by default in reverse mode by
+        [`StepReplayAdjoint`][], from the very steps that were made. For forward mode pass
+        `diffrax.ForwardMode()`. Diffrax's other adjoints compute steps again, which round
+        differently and get other sizes: where tolerances are tight their gradients are less
+        accurate than the solution.
 
     Python numbers among the arguments (`t1`, tolerances) are part of the compiled program; pass
     `jnp.asarray(...)` to solve with other values without compiling again.
@@ -101,9 +108,8 @@ def diffeqsolve(
     if throw and isinstance(stepsize_controller, dfx.ConstantStepSize) and dt0 is not None:
         y0 = _raise_if_unstable(y0, terms, solver, dt0)
     if not isinstance(solver, AbstractManifoldSolver):
-        return dfx.diffeqsolve(
-            terms, solver, t0, t1, dt0, y0, args, saveat=saveat, event=event, throw=throw, **options
-        )
+        solver, options = with_accurate_stages(solver), options | dict(event=event, throw=throw)
+        return dfx.diffeqsolve(terms, solver, t0, t1, dt0, y0, args, saveat=saveat, **options)
     time_dtype = _time_dtype(t0, t1, dt0, saveat)
     y0 = _as_state(y0, time_dtype)
     t0, t1 = jnp.asarray(t0, time_dtype), jnp.asarray(t1, time_dtype)

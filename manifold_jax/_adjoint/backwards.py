@@ -174,11 +174,11 @@ class Backwards(eqx.Module):
         part = lambda x, i: lax.dynamic_slice_in_dim(x, i * sizes.segment, sizes.segment)
         times = part(record.times, i)
         accepted = times[..., 1] > -jnp.inf
-        # Rows of no accepted step hold the first one: functions may refuse what is not a state
-        # or time.
-        times = jnp.where(accepted[..., None], times, record.times[0, 0])
-        jumped = times[..., 2] > 0 if record.jumps else False
-        times = times[..., 0], times[..., 1], jumped, accepted
+        # Rows of no accepted step hold one of no length from the first state: functions may refuse
+        # what is not a state or time.
+        start, end = (jnp.where(accepted, times[..., i], self.ends.t0) for i in range(2))
+        jumped = accepted & (times[..., 2] > 0) if record.jumps else False
+        times = start, end, jumped, accepted
         last = max(sizes.kept // sizes.segment - 1, 0)
         kept = lambda: {k: part(x, jnp.minimum(i, last)) for k, x in record.states.items()}
         again = lambda: self._states_again(i, Step(*times, {}))

@@ -1,5 +1,6 @@
 """A solve as functions of single steps and of what is saved in them."""
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -120,7 +121,7 @@ def memory_of(solver_state: Any) -> Any:
 
 def with_memory(solver_state: Any, memory: Any) -> Any:
     if isinstance(solver_state, HookState):
-        return HookState(memory, solver_state.first_step, solver_state.statistics)
+        return dataclasses.replace(solver_state, inner=memory)
     return memory
 
 

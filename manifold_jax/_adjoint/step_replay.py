@@ -133,7 +133,8 @@ class StepReplayAdjoint(dfx.AbstractAdjoint):
         # What the functions close over becomes their leaves, which have derivatives.
         forward = eqx.filter_closure_convert(forward, record)
         differentiable = replay, start, times, forward
-        (final_state, statistics), handed_out = _solve(differentiable, record, solve.remembers)
+        rest, handed_out = _solve(differentiable, record, solve.remembers)
+        final_state, statistics = _without_derivative(rest)
         return handed_out.put_into(final_state), statistics
 
 
@@ -149,6 +150,19 @@ _UNBOUNDED = (
 
 def _while_loop(*args: Any, checkpoints: Any = None, **kwargs: Any) -> Any:
     return while_loop(*args, kind="lax", **kwargs)
+
+
+@eqx.filter_custom_jvp
+def _without_derivative(tree):
+    """Whole numbers, too: JAX gives those that leave a `custom_vjp` a derivative of their own kind,
+    which not every operation takes."""
+    return tree
+
+
+@_without_derivative.def_jvp
+def _no_derivative(primals, tangents):
+    (tree,), _ = primals, tangents
+    return tree, jtu.tree_map(lambda leaf: None, tree)
 
 
 class HandedOut(NamedTuple):

@@ -15,6 +15,7 @@ from .._compat import is_okay, nonlinear_failure, update_result
 from .._custom_types import Args, BoolScalar, FloatScalar, IntScalar, RealScalarLike, Y
 from .._projection import ProjectionInfo
 from .explicit import explicit_step, is_first_same_as_last, is_unrollable, refreshed
+from .implicit import carries_derivative, step_with_derivative
 
 
 class StepStatistics(eqx.Module):
@@ -64,6 +65,8 @@ def initial_state(
     if is_unrollable(inner, terms, t0, t1, y0, args):
         fsal = is_first_same_as_last(inner.tableau)  # pyright: ignore
         inner_state = terms.vf(t0, y0, args) if fsal else None
+    elif carries_derivative(inner, terms, t0, t1, y0, args):
+        inner_state = inner.func(terms, t0, y0, args)
     else:
         inner_state = inner.init(terms, t0, t1, y0, args)
     return HookState(inner_state, jnp.abs(jnp.asarray(t1) - t0), StepStatistics.zero(y0))
@@ -92,12 +95,17 @@ def advance(
             tableau, terms, stage_terms, t0, t1, y0, args, f0, correct
         )
         return Step(y1, raw, error, dense_info, f1 if fsal else None, RESULTS.successful, info)
-    # The derivative that the solver carried over belongs to the uncorrected state.
-    # Diffrax evaluates it anew if any lane of a batch needs it, so that keeping it
-    # would make the lanes depend on each other; always evaluating it does not.
-    raw, error, dense_info, inner_state, result = inner.step(
-        stage_terms, t0, t1, y0, args, inner_state, made_jump=True
-    )
+    if carries_derivative(inner, terms, t0, t1, y0, args):
+        raw, error, dense_info, inner_state, result = step_with_derivative(
+            inner, terms, stage_terms, t0, t1, y0, args, inner_state, made_jump
+        )
+    else:
+        # What a solver carried over belongs to the uncorrected state. Diffrax evaluates it anew
+        # if any lane of a batch needs it, so that keeping it would make the lanes depend on each
+        # other; always evaluating it does not.
+        raw, error, dense_info, inner_state, result = inner.step(
+            stage_terms, t0, t1, y0, args, inner_state, made_jump=True
+        )
     y1, info = correct(raw)
     return Step(y1, raw, error, dense_info, inner_state, result, info)
 

@@ -18,6 +18,7 @@ from .._interpolation import CorrectedInterpolationFactory
 from .._projection import NewtonProjection, ProjectionInfo
 from .advance import advance, conclude, HookState, initial_state
 from .base import AbstractManifoldSolver, check_hook_arguments, check_noise
+from .implicit import with_accurate_stages
 from .rewrite import rewrite_terms, RewrittenTerm
 
 
@@ -74,7 +75,7 @@ class LocalCoordinates(AbstractManifoldSolver):
                 "`constraint` is redundant: equations that depend on each other define no local coordinates. "
                 "Remove the dependent ones, or use `mj.Projected(solver, constraint)`."
             )
-        self.inner = solver
+        self.inner = with_accurate_stages(solver)
         self.constraint = constraint
         self.projection = NewtonProjection() if projection is None else projection
         self.chart = chart

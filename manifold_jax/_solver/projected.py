@@ -12,6 +12,7 @@ from .._interpolation import CorrectedInterpolationFactory
 from .._projection import NewtonProjection, ProjectionInfo
 from .advance import advance, conclude, HookState, initial_state
 from .base import AbstractManifoldSolver, check_hook_arguments, check_noise
+from .implicit import with_accurate_stages
 
 
 class Projected(AbstractManifoldSolver):
@@ -67,7 +68,7 @@ class Projected(AbstractManifoldSolver):
         projection: NewtonProjection | None = None,
     ):
         check_hook_arguments(solver, constraint, "Projected")
-        self.inner = solver
+        self.inner = with_accurate_stages(solver)
         self.constraint = constraint
         self.projection = NewtonProjection() if projection is None else projection
         self.bend_interpolant = True

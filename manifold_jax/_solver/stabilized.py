@@ -18,6 +18,7 @@ from .._stabilization import (
 )
 from .advance import advance, conclude, HookState, initial_state
 from .base import AbstractManifoldSolver, check_hook_arguments
+from .implicit import with_accurate_stages
 from .rewrite import has_several, rewrite_terms, RewrittenTerm
 
 
@@ -67,7 +68,7 @@ class Stabilized(AbstractManifoldSolver):
                 "`stabilization` must be `mj.InvariantStabilization(gain)` or `mj.ExactStabilization(gain)`, "
                 f"got {type(stabilization).__name__}. Baumgarte's method is an argument of `mj.MechanicalSystem`."
             )
-        self.inner = solver
+        self.inner = with_accurate_stages(solver)
         self.constraint = constraint
         self.projection = NewtonProjection() if projection is None else projection
         self.stabilization = stabilization
