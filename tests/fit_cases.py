@@ -22,8 +22,11 @@ TS = np.linspace(0, 4, 31)
 Y0 = np.array([1.0, 0.0])  # moved onto the circle
 
 
+BUILT = []  # grows with every call of the model, and so with every program that is compiled
+
+
 def circle(parameters):
-    del parameters
+    BUILT.append(parameters)
     return TURN, CIRCLE
 
 

@@ -69,7 +69,11 @@ def left_if_linear(
 
 def _near(u: Float[Array, " N"], transform: Transform, left: float) -> np.ndarray:
     start = np.asarray(transform.start)
-    theta, side = np.asarray(transform.values(u[: start.size])), np.zeros(start.shape, int)
+    side = np.zeros(start.shape, int)
+    # The distance is at least `exp(-abs(u))` of that from the start.
+    if np.all(np.abs(np.asarray(u[: start.size])) < -np.log(left)):
+        return side
+    theta = np.asarray(transform.values(u[: start.size]))
     for sign, bound in ((-1, np.asarray(transform.lower)), (1, np.asarray(transform.upper))):
         near = np.abs(theta - bound) <= left * np.abs(start - bound)
         side = np.where(np.isfinite(bound) & near, sign, side)

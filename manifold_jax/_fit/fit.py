@@ -14,7 +14,6 @@ from .data import check_times, make_records
 from .model import check_solver, Simulator
 from .optimize import Options
 from .parameters import make_transform
-from .pieces import make_pieces
 from .progress import Meter
 from .report import FitResult
 from .setup import (
@@ -26,10 +25,6 @@ from .setup import (
 )
 from .starts import choose, draw_points, optimize_all, see, with_scales
 from .summary import summarize
-
-
-# Unknowns of one trajectory beyond which one reverse sweep is cheaper than a forward sweep for each.
-_MANY_UNKNOWNS = 50
 
 
 def fit(
@@ -171,13 +166,9 @@ def fit(
     check_options(options, optimizer, loss, segments, records)
     with Meter(progress) as meter:
         with meter.compiling("the solves"):
-            pieces = make_pieces(records, segments, simulator, transform, states, fit_initial)
-            reverse = isinstance(optimizer, optax.GradientTransformation) and (
-                transform.start.size + pieces.basis.shape[-1] > _MANY_UNKNOWNS
-            )
-            objective = make_objective(
-                simulator, transform, pieces, records, fit_initial, loss, seen, reverse
-            )
+            by_gradient = isinstance(optimizer, optax.GradientTransformation)
+            rest = segments, states, fit_initial, loss, seen, by_gradient
+            objective = make_objective(simulator, transform, records, *rest)
             points = _unknowns(objective, options)
             given = see(points[0], objective, optimizer)
         points, losses = choose(points, given, objective, optimizer, starts, meter)

@@ -67,10 +67,11 @@ def optimize(
 def _within_bounds(
     objective: Objective, u: Any, solver: Any, options: Options, meter: Meter
 ) -> Outcome:
-    """Each parameter is put on a bound at most once, and taken off again if it belongs inside after
-    the others have moved."""
+    """Each parameter is put on a bound at most once, and at most once taken off again, if it belongs
+    inside after the others have moved."""
     transform = objective.transform
     losses, movable = [], np.ones(transform.start.size, bool)
+    returning = movable.copy()
     while True:
         found = _with_optimistix(objective, u, solver, options, meter, losses, movable)
         side = driven(found.u, found.solved, objective) * movable
@@ -85,9 +86,10 @@ def _within_bounds(
             return found
         beside = put_beside_bounds(found.u, side, BESIDE, transform)
         left = left_if_linear(beside, side, look(beside, objective, solver)[1], objective)
-        inside = (side != 0) & (left > 2)
+        inside = (side != 0) & (left > 2) & returning
         if not np.any(inside):
             return found
+        returning &= ~inside
         left = np.clip(BESIDE * left, BESIDE, 0.1)
         u = put_beside_bounds(found.u, side * inside, left, transform)
 

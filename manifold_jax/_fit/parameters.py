@@ -44,16 +44,6 @@ class Transform(eqx.Module):
     def parameters(self, u: Float[Array, " p"]) -> Any:
         return self.unravel(self.values(u))
 
-    def unknowns(self, theta: np.ndarray) -> np.ndarray:
-        """The inverse of `values`, `(..., p)`, strictly within the bounds."""
-        s, a, b = (np.asarray(x) for x in (self.start, self.lower, self.upper))
-        has_a, has_b = np.isfinite(a), np.isfinite(b)
-        u = (theta - s) / np.where(s == 0, 1.0, np.abs(s))
-        u[..., has_a | has_b] = 0.0
-        u[..., has_a] += np.log((theta - a)[..., has_a] / (s - a)[has_a])
-        u[..., has_b] -= np.log((b - theta)[..., has_b] / (b - s)[has_b])
-        return u
-
 
 def make_transform(parameters: Any, bounds: Any, positive: Any) -> Transform:
     """Check start values and bounds, and name every number."""

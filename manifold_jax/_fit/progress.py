@@ -26,7 +26,7 @@ class Meter:
         )
         self.task = self.bar.add_task("fit", total=None, loss="")
         self.known: set[str] = set()
-        self.name, self.listed, self.count = "fit", False, 0
+        self.name, self.listed, self.count, self.steps = "fit", False, 0, 0
         self.begun = self.last = time.perf_counter()
 
     def __enter__(self) -> "Meter":
@@ -53,6 +53,7 @@ class Meter:
     def begin(self, name: str, steps: int, listed: bool = False) -> None:
         """`listed`: whether its end stays on a terminal, too."""
         self.name, self.listed, self.count = name, listed, 0
+        self.steps = steps
         self.bar.reset(self.task, total=steps, description=name, loss="")
 
     def advance(self, loss: float) -> None:
@@ -66,6 +67,7 @@ class Meter:
             self._line(text, self.in_lines)
 
     def end(self, loss: float, message: str) -> None:
+        self.bar.update(self.task, completed=self.steps, refresh=True)
         text = f"{self.name}: {message}, {self.count} steps, loss {loss:.6g}"
         self._line(text, self.in_lines or (self.shown and self.listed))
 

@@ -15,6 +15,11 @@ from .model import Simulator
 from .objective import Objective
 from .optimize import Options
 from .parameters import Transform
+from .pieces import make_pieces
+
+
+# Unknowns of one trajectory beyond which one reverse sweep is cheaper than a forward sweep for each.
+_MANY_UNKNOWNS = 50
 
 
 def refuse_tracers(**given: Any) -> None:
@@ -93,13 +98,16 @@ def check_amount(unknowns: int, objective: Objective) -> None:
 def make_objective(
     simulator: Any,
     transform: Transform,
-    pieces: Any,
     records: Records,
+    segments: int,
+    states: Any,
     fit_initial: bool,
     loss: Any,
     seen: Any,
-    reverse: bool,
+    by_gradient: bool,
 ) -> Objective:
+    pieces = make_pieces(records, segments, simulator, transform, states, fit_initial)
+    reverse = by_gradient and transform.start.size + pieces.basis.shape[-1] > _MANY_UNKNOWNS
     first = np.asarray(pieces.first)
     free = np.flatnonzero(~first | fit_initial)
     joints = np.flatnonzero(~np.roll(first, -1))

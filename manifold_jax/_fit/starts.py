@@ -42,12 +42,10 @@ def draw_points(transform: Transform, starts: int, seed: int) -> np.ndarray:
     cube = qmc.LatinHypercube(s.size, rng=np.random.default_rng(seed)).random(
         _POINTS * (starts - 1)
     )
-    around = 2 * cube - 1
-    factor = np.where(np.isfinite(a) | np.isfinite(b), np.log(_FACTOR), 1.0)
-    both = np.isfinite(a) & np.isfinite(b)
-    within = np.where(both, np.where(both, a, 0) + np.where(both, b - a, 0) * cube, s)
-    others = np.where(both, transform.unknowns(within), factor * around)
-    return np.concatenate([given, others])
+    one, both = np.isfinite(a) | np.isfinite(b), np.isfinite(a) & np.isfinite(b)
+    around = np.where(one, np.log(_FACTOR), 1.0) * (2 * cube - 1)
+    within = np.log(cube / (1 - cube)) - np.log(np.where(both, (s - a) / (b - s), 1.0))
+    return np.concatenate([given, np.where(both, within, around)])
 
 
 def see(u: Any, objective: Objective, optimizer: Any) -> Seen:
@@ -64,7 +62,8 @@ def choose(
     """The given start, the first of `points`, and of the others those with the fewest failures, then
     with the lowest losses."""
     seen = [given]
-    meter.begin("fit: looking for starts", len(points) - 1)
+    if starts > 1:
+        meter.begin("fit: looking for starts", len(points) - 1)
     for u in points[1:]:
         seen.append(see(u, objective, optimizer))
         meter.advance(seen[-1].loss)
@@ -118,7 +117,7 @@ def optimize_all(
 
 
 def _better(new: Outcome, old: Outcome) -> bool:
-    """Of the same optimum, the one where the optimizer converged."""
-    if abs(new.loss - old.loss) <= _SAME * abs(old.loss):
-        return new.success and not old.success
+    """Of the same optimum, rather one where the optimizer converged."""
+    if abs(new.loss - old.loss) <= _SAME * abs(old.loss) and new.success != old.success:
+        return new.success
     return new.loss < old.loss
