@@ -44,7 +44,9 @@ def draw_points(transform: Transform, starts: int, seed: int) -> np.ndarray:
     )
     one, both = np.isfinite(a) | np.isfinite(b), np.isfinite(a) & np.isfinite(b)
     around = np.where(one, np.log(_FACTOR), 1.0) * (2 * cube - 1)
-    within = np.log(cube / (1 - cube)) - np.log(np.where(both, (s - a) / (b - s), 1.0))
+    given_place = np.where(both, s - a, 1.0) / np.where(both, b - a, 2.0)
+    logit = lambda place: np.log(place / (1 - place))
+    within = logit(cube) - logit(given_place)
     return np.concatenate([given, np.where(both, within, around)])
 
 
