@@ -124,6 +124,7 @@ def test_a_parameter_at_its_bound_is_not_undetermined():
     np.testing.assert_allclose(result.standard_errors["rate"], expected, rtol=1e-6)
     assert re.search(r"radius +2.1 at its bound", str(result))
     assert "not determined" not in str(result)
+    assert "a bound too narrow" in str(result)
     upper = fit_circle(DATA, {"rate": 1.1, "radius": 1.3}, bounds=(0.0, 1.9), sigma=SIGMA)
     np.testing.assert_allclose(upper.parameters["radius"], 1.9, rtol=1e-15)
     assert upper.at_bounds == ("radius",)

@@ -109,10 +109,11 @@ class FitResult(eqx.Module):
         if self.fits is not False:
             return [f"{state}: {ended}"]
         state = "DOES NOT FIT" if self.success else state
+        narrow = ", a bound too narrow" if self.at_bounds else ""
         return [
             f"{state}: residuals are {self.noise:.3g} times `sigma`; {ended}",
             "  Perhaps a local optimum: try other `starts` (`starts=8`), for long records `segments`.",
-            "  Otherwise the model is wrong or `sigma` too small. Standard errors do not hold.",
+            f"  Otherwise the model is wrong{narrow} or `sigma` too small. Standard errors do not hold.",
         ]
 
     def _numbers(self) -> list[str]:
