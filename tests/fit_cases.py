@@ -13,6 +13,35 @@ import numpy as np
 import manifold_jax as mj
 
 
+# A point on a circle, `y = r (cos(w t + a), sin(w t + a))`: rate in the field, radius in the constraint.
+TURN = dfx.ODETerm(lambda t, y, args: args["rate"] * jnp.stack([-y[1], y[0]]))
+CIRCLE = mj.Constraint(lambda t, y, args: y @ y - args["radius"] ** 2)
+TRUTH = {"rate": 1.5, "radius": 2.0}
+START = {"rate": 1.1, "radius": 2.6}
+TS = np.linspace(0, 4, 31)
+Y0 = np.array([1.0, 0.0])  # moved onto the circle
+
+
+BUILT = []  # grows with every call of the model, and so with every program that is compiled
+
+
+def circle(parameters):
+    BUILT.append(parameters)
+    return TURN, CIRCLE
+
+
+def positions(ts, rate=1.5, radius=2.0, angle=0.0):
+    return radius * np.stack([np.cos(rate * ts + angle), np.sin(rate * ts + angle)], axis=-1)
+
+
+def noisy(data, size, seed=0):
+    return data + size * np.random.default_rng(seed).normal(size=data.shape)
+
+
+def fit_circle(data, parameters=START, ts=TS, model=circle, **options):
+    return mj.fit(model, parameters, ts, data, **{"y0": Y0, **options})
+
+
 class Case(NamedTuple):
     """What `mj.fit` needs; `sigma` like the data, `truth` like the parameters."""
 

@@ -13,34 +13,20 @@ import numpy as np
 import optax
 import optimistix as optx
 import pytest
+from fit_cases import (
+    CIRCLE,
+    circle,
+    fit_circle,
+    noisy,
+    positions,
+    START,
+    TRUTH,
+    TS,
+    TURN,
+    Y0,
+)
 
 import manifold_jax as mj
-
-
-# A point on a circle, `y = r (cos(w t + a), sin(w t + a))`: rate in the field, radius in the constraint.
-TURN = dfx.ODETerm(lambda t, y, args: args["rate"] * jnp.stack([-y[1], y[0]]))
-CIRCLE = mj.Constraint(lambda t, y, args: y @ y - args["radius"] ** 2)
-TRUTH = {"rate": 1.5, "radius": 2.0}
-START = {"rate": 1.1, "radius": 2.6}
-TS = np.linspace(0, 4, 31)
-Y0 = np.array([1.0, 0.0])  # moved onto the circle
-
-
-def circle(parameters):
-    del parameters
-    return TURN, CIRCLE
-
-
-def positions(ts, rate=1.5, radius=2.0, angle=0.0):
-    return radius * np.stack([np.cos(rate * ts + angle), np.sin(rate * ts + angle)], axis=-1)
-
-
-def noisy(data, size, seed=0):
-    return data + size * np.random.default_rng(seed).normal(size=data.shape)
-
-
-def fit_circle(data, parameters=START, ts=TS, model=circle, **options):
-    return mj.fit(model, parameters, ts, data, **{"y0": Y0, **options})
 
 
 def assert_close(parameters, truth, tolerance):
@@ -250,49 +236,24 @@ def test_steps_into_parameters_that_cannot_be_solved_are_rejected():
 
 def test_what_the_data_do_not_determine_is_named():
     """Only the product of two numbers matters, and a third does not matter at all."""
-    start = {"a": 1.0, "b": 1.1, "radius": 2.5, "unused": 3.0}
+    start = {"a": 1.0, "b": 1.1e-3, "radius": 2.5, "unused": 3.0}
     result = fit_circle(positions(TS), start, model=_product, sigma=0.01)
-    lines = "\n".join(result.unidentifiable)
-    assert len(result.unidentifiable) == 2
-    assert "unused" in lines
-    assert any("a (" in line and "b (" in line for line in result.unidentifiable)
-    assert "radius" not in lines
+    # In the parameters' own units, and each line of as few as possible.
+    ratio = -result.parameters["b"] / result.parameters["a"]
+    assert sorted(result.unidentifiable) == [f"a (+1) with b ({ratio:+.3g})", "unused (+1)"]
     errors = result.standard_errors
     assert np.isinf(errors["a"])
     assert np.isinf(errors["b"])
     assert np.isinf(errors["unused"])
     assert 0 < errors["radius"] < 0.01
     assert "not determined by the data" in str(result)
-    np.testing.assert_allclose(result.parameters["a"] * result.parameters["b"], 1.5, rtol=1e-6)
+    np.testing.assert_allclose(result.parameters["a"] * result.parameters["b"], 1.5e-3, rtol=1e-6)
     assert not np.any(np.isnan(result.covariance))
 
 
 def _product(parameters):
-    terms = dfx.ODETerm(lambda t, y, args: args["a"] * args["b"] * jnp.stack([-y[1], y[0]]))
+    terms = dfx.ODETerm(lambda t, y, args: 1e3 * args["a"] * args["b"] * jnp.stack([-y[1], y[0]]))
     return terms, CIRCLE
-
-
-def test_bounds_are_kept_and_reported():
-    bounds = ({"rate": -np.inf, "radius": 2.1}, {"rate": 10.0, "radius": 3.0})
-    result = fit_circle(positions(TS), bounds=bounds, throw=False)
-    assert 2.1 <= result.parameters["radius"] < 2.1 + 1e-4
-    assert result.at_bounds == ("radius",)
-    assert "at a bound: radius" in str(result)
-    result = fit_circle(positions(TS), bounds=(0.5, 4.0))
-    assert result.at_bounds == ()
-    assert_close(result.parameters, TRUTH, 1e-7)
-
-
-def test_report_and_picture(tmp_path, capsys):
-    result = fit_circle(positions(TS), progress=True)
-    assert "fit" in capsys.readouterr().out
-    text = str(result)
-    assert text.startswith("fitted: converged")
-    assert "radius" in text
-    assert "+-" in text
-    figure = result.plot(tmp_path / "fit.png")
-    assert (tmp_path / "fit.png").stat().st_size > 1000
-    assert len(figure.axes) == 3
 
 
 def test_too_few_steps():
@@ -385,8 +346,6 @@ def test_bad_input_for_problems_and_many_records():
         fit_circle(MANY, ts=GRID)
     with pytest.raises(ValueError, match="`states` must be on the grid"):
         fit_circle(GOOD, segments=2, states=GOOD[:5])
-    with pytest.raises(ValueError, match="every solve from the start values fails"):
-        fit_circle(GOOD, jnp.asarray(1.0), y0=100 * Y0, model=_summed)
 
 
 def as_users_run_it(case):
@@ -419,7 +378,7 @@ def test_masses_need_a_known_force():
     start = {"masses": np.array([1.2, 0.8])}
     result = mj.fit(problem, start, ts, problem.reference(ts), sigma=0.01, positive=True)
     (line,) = result.unidentifiable
-    assert line == "masses[0] (+1.00) with masses[1] (+1.00)"
+    assert line == "masses[0] (+1) with masses[1] (+1)"
 
 
 @pytest.mark.slow

@@ -12,16 +12,19 @@ import optimistix as optx
 
 from .data import check_times, make_records
 from .model import check_solver, Simulator
-from .optimize import look, optimize, Options
+from .optimize import Options
 from .parameters import make_transform
-from .pieces import make_pieces
+from .progress import Meter
 from .report import FitResult
-from .setup import check_amount, check_initial, check_options, make_objective, with_scales
+from .setup import (
+    check_amount,
+    check_initial,
+    check_options,
+    make_objective,
+    refuse_tracers,
+)
+from .starts import choose, draw_points, optimize_all, see, with_scales
 from .summary import summarize
-
-
-# Unknowns of one trajectory beyond which one reverse sweep is cheaper than a forward sweep for each.
-_MANY_UNKNOWNS = 50
 
 
 def fit(
@@ -44,6 +47,7 @@ def fit(
     patience: int = 20,
     batch_size: int | None = None,
     seed: int = 0,
+    starts: int = 1,
     segments: int = 1,
     states: Any = None,
     solver: Any = dfx.Tsit5(),  # noqa: B008
@@ -90,7 +94,7 @@ def fit(
     - `missing`: `"nan"` says that values that are NaN were not measured; otherwise refused.
     - `bounds`: `(lower, upper)`, each a number or like `parameters`; `positive`: `True`, or
         like `parameters`, for a lower bound of 0. Kept by a change of variables; a positive
-        parameter is searched for on a logarithmic scale.
+        parameter is searched for on a logarithmic scale, one that is driven to a bound put on it.
     - `fit_initial`: whether initial states are unknown, too, each with as many unknowns as the
         manifold has dimensions; `y0` is then the guess, near enough to be left along the
         tangent space. The matrices grow with the number of records.
@@ -104,6 +108,12 @@ def fit(
     - `steps`: the most of them; `patience`: stop after so many without a decrease.
     - `batch_size`: with Optax, records in each step, in an order drawn with `seed`; `steps` then counts
         passes through all records.
+    - `starts`: how many times to fit, of which the best is kept and all are listed
+        (`result.starts`): from `parameters`, and from those points with the lowest losses of eight
+        times as many, a Latin hypercube around `parameters` drawn with `seed`. In it a parameter with
+        two bounds is anywhere between them; with one, `positive` for instance, up to 3 times nearer to
+        it or farther away; without, between 0 and twice its start value (-1 and 1 if that is 0). Use it
+        where a fit ends in a local minimum. All starts share one compiled program.
     - `segments`: multiple shooting, into how many pieces to cut each record. The states where they
         begin are further unknowns on the manifold, which meet the ends of the pieces before
         them in the end. Use it for long records of oscillating or chaotic motion, where
@@ -113,7 +123,8 @@ def fit(
     - `solver`: a Diffrax solver, wrapped in [`Projected`][], or a function of the constraint.
     - `stepsize_controller`, `dt0`, `max_steps`: as for [`diffeqsolve`][]. The default tolerance
         is 1e-8 (1e-5 in single precision).
-    - `progress`: whether to show a progress bar.
+    - `progress`: whether to say what is being compiled and how far the steps are: by a progress bar
+        on a terminal, by lines in a file or a notebook.
     - `throw`: whether a fit that did not end well raises; otherwise look at `result.success`.
 
     Not to be called inside `jit` or `vmap`: the optimizer's loop runs in Python, its steps are
@@ -123,7 +134,8 @@ def fit(
     **Returns:**
 
     A [`FitResult`][]: `parameters`, `standard_errors` and `covariance` (`s^2 (J^T J)^-1`
-    with the Jacobian `J` of the weighted residuals), history, report (`print`) and `plot`.
+    with the Jacobian `J` of the weighted residuals), with `sigma` given the verdict of a chi-squared
+    test (`fits`, `probability`), history, report (`print`) and `plot`.
 
     **Raises:**
 
@@ -133,6 +145,9 @@ def fit(
     Sources: Seber & Wild, Nonlinear Regression (1989); multiple shooting: Bock, in Numerical
     Treatment of Inverse Problems in Differential and Integral Equations (1983), 95-121.
     """
+    refuse_tracers(
+        model=model, parameters=parameters, ts=ts, data=data, y0=y0, sigma=sigma, states=states
+    )
     check_times(ts)
     check_solver(solver)
     many = np.ndim(ts) == 2
@@ -147,27 +162,37 @@ def fit(
     t0 = getattr(model, "t0", None) if t0 is None and hasattr(model, "with_args") else t0
     records = make_records(ts, data, sigma, missing, t0, seen)
     optimizer = _default_optimizer() if optimizer is None else optimizer
-    options = Options(steps, patience, batch_size, seed, progress)
+    options = Options(steps, patience, batch_size, seed, starts)
     check_options(options, optimizer, loss, segments, records)
-    pieces = make_pieces(records, segments, simulator, transform, states, fit_initial)
-    reverse = isinstance(optimizer, optax.GradientTransformation) and (
-        transform.start.size + pieces.basis.shape[-1] > _MANY_UNKNOWNS
-    )
-    objective = make_objective(
-        simulator, transform, pieces, records, fit_initial, loss, seen, reverse
-    )
-    unknowns = transform.start.size + objective.free.size * pieces.basis.shape[-1]
-    check_amount(unknowns, objective)
-    u = jnp.zeros(unknowns, transform.start.dtype)
-    objective = with_scales(objective, look(u, objective, optimizer))
-    outcome = optimize(objective, u, optimizer, options)
-    result = summarize(objective, outcome, records, sigma is not None, seen)
+    with Meter(progress) as meter:
+        with meter.compiling("the solves"):
+            by_gradient = isinstance(optimizer, optax.GradientTransformation)
+            rest = segments, states, fit_initial, loss, seen, by_gradient
+            objective = make_objective(simulator, transform, records, *rest)
+            points = _unknowns(objective, options)
+            given = see(points[0], objective, optimizer)
+        points, losses = choose(points, given, objective, optimizer, starts, meter)
+        objective = with_scales(objective, losses)
+        outcome, table = optimize_all(objective, points, losses, optimizer, options, meter)
+        with meter.compiling("the standard errors"):
+            result = summarize(objective, outcome, table, records, sigma is not None, seen)
     if throw and not result.success:
         raise RuntimeError(
-            f"The fit failed: {result.message}. Start closer, give `bounds`, allow more `steps`, or "
-            "cut long records into `segments`; with `throw=False` the result is returned."
+            f"The fit failed: {result.message}. Start closer or several times (`starts=8`), give "
+            "`bounds`, allow more `steps`, or cut long records into `segments`; with `throw=False` "
+            "the result is returned."
         )
     return result
+
+
+def _unknowns(objective: Any, options: Options) -> list[Any]:
+    """At all starts: those of the parameters, then those of initial states, which are at their guess."""
+    transform = objective.transform
+    states = objective.free.size * objective.pieces.basis.shape[-1]
+    check_amount(transform.start.size + states, objective)
+    drawn = draw_points(transform, options.starts, options.seed)
+    whole = np.concatenate([drawn, np.zeros((len(drawn), states))], axis=1)
+    return [jnp.asarray(u, transform.start.dtype) for u in whole]
 
 
 def _default_optimizer() -> Any:

@@ -105,6 +105,29 @@ def weighted(objective: Objective, predicted: Prediction) -> Float[Array, "piece
     return jnp.where(predicted.failed[:, None, None] > 0, penalty, r)
 
 
+class Linearized(NamedTuple):
+    """Weighted residuals, the gaps, and their derivatives; the slopes `d theta / d u`."""
+
+    r: Float[Array, "pieces L k"]
+    J: Float[Array, "pieces L k N"]
+    gaps: Float[Array, "joints d"]
+    C: Float[Array, "joints d N"]
+    slopes: Float[Array, " p"]
+
+
+@eqx.filter_jit
+def linearize(u: Float[Array, " N"], solved: Solved, objective: Objective) -> Linearized:
+    def both(u: Any) -> Any:
+        predicted = solved.around(u, objective)
+        out = weighted(objective, predicted), gaps(objective, predicted)
+        return out, out
+
+    (J, C), (r, c) = jax.jacfwd(both, has_aux=True)(u)
+    values, p = objective.transform.values, objective.transform.start.size
+    slopes = jax.jvp(values, (u[:p],), (jnp.ones_like(u[:p]),))[1]
+    return Linearized(r, J, c, C, slopes)
+
+
 def residuals(u: Float[Array, " N"], objective: Objective) -> tuple[Any, Any]:
     """For least-squares solvers: of the data and of the joints; then the loss and all pieces."""
     solved = solve(u, objective)

@@ -1,4 +1,4 @@
-"""The loops around optimizers: history, progress, early stop."""
+"""The loops around optimizers: history, early stop, parameters at bounds."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -9,82 +9,118 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import optimistix as optx
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-from .objective import gaps, Objective, residuals, solve, Solved, total_loss
+from .bounds import (
+    BESIDE,
+    driven,
+    left_if_linear,
+    on_bounds,
+    put_beside_bounds,
+    put_on_bounds,
+)
+from .objective import gaps, Objective, residuals, Solved, total_loss
+from .progress import Meter
 
 
 class Options(NamedTuple):
-    """How long to go on, and who watches."""
+    """How long to go on, how often to start, and in which order."""
 
     steps: int
     patience: int
     batch_size: int | None
     seed: int
-    progress: bool
+    starts: int
 
 
 class Outcome(NamedTuple):
-    """The unknowns, all pieces there, the loss of each step, and how it ended."""
+    """The unknowns, all pieces and the loss there, the loss of each step, and how it ended."""
 
     u: Any
     solved: Solved
     losses: list[float]
+    loss: float
     success: bool
     message: str
 
 
-class _Meter:
-    """A progress bar with the loss, or nothing."""
-
-    def __init__(self, options: Options):
-        columns = TextColumn("fit"), BarColumn(), TextColumn("{task.fields[loss]}")
-        self.bar = Progress(*columns, TimeElapsedColumn(), disable=not options.progress)
-        self.task = self.bar.add_task("fit", total=options.steps, loss="")
-
-    def advance(self, loss: float) -> None:
-        self.bar.update(self.task, advance=1, loss=f"loss {loss:.6g}")
-
-
-def look(u: Any, objective: Objective, optimizer: Any) -> Solved:
-    """All pieces at one point, by the program that takes steps if it can tell: compiling takes
-    longer than solving."""
+def look(u: Any, objective: Objective, optimizer: Any) -> tuple[Any, Solved]:
+    """The loss and all pieces at one point, by the program that takes steps if it can tell:
+    compiling takes longer than solving."""
     if isinstance(optimizer, optax.GradientTransformation):
-        return _solve(u, objective)
-    state = _initialize(optimizer, u, objective)
-    return _advance(optimizer, u, objective, state)[2][1]
+        return _loss(u, objective)[1]
+    return _advance(optimizer, u, objective, _initialize(optimizer, u, objective))[2]
 
 
-_solve = eqx.filter_jit(solve)
+_loss = eqx.filter_jit(total_loss)
 
 
-def optimize(objective: Objective, u: Any, optimizer: Any, options: Options) -> Outcome:
+def optimize(
+    objective: Objective, u: Any, optimizer: Any, options: Options, meter: Meter
+) -> Outcome:
     if isinstance(optimizer, optax.GradientTransformation):
-        return _with_optax(objective, u, optimizer, options)
+        return _with_optax(objective, u, optimizer, options, meter)
     if objective.joints.size == 0:
-        return _with_optimistix(objective, u, optimizer, options)
-    return _closing_gaps(objective, u, optimizer, options)
+        return _within_bounds(objective, u, optimizer, options, meter)
+    return _closing_gaps(objective, u, optimizer, options, meter)
 
 
-def _with_optimistix(objective: Objective, u: Any, solver: Any, options: Options) -> Outcome:
+def _within_bounds(
+    objective: Objective, u: Any, solver: Any, options: Options, meter: Meter
+) -> Outcome:
+    """Each parameter is put on a bound at most once, and at most once taken off again, if it belongs
+    inside after the others have moved."""
+    transform = objective.transform
+    losses, movable = [], np.ones(transform.start.size, bool)
+    returning = movable.copy()
+    while True:
+        found = _with_optimistix(objective, u, solver, options, meter, losses, movable)
+        side = driven(found.u, found.solved, objective) * movable
+        if np.any(side):
+            movable &= side == 0
+            there = put_on_bounds(found.u, side)
+            loss, _ = look(there, objective, solver)
+            u = there if float(loss) <= losses[-1] else found.u
+            continue
+        side = on_bounds(found.u, transform)
+        if not found.success or not np.any(side):
+            return found
+        beside = put_beside_bounds(found.u, side, BESIDE, transform)
+        left = left_if_linear(beside, side, look(beside, objective, solver)[1], objective)
+        inside = (side != 0) & (left > 2) & returning
+        if not np.any(inside):
+            return found
+        returning &= ~inside
+        left = np.clip(BESIDE * left, BESIDE, 0.1)
+        u = put_beside_bounds(found.u, side * inside, left, transform)
+
+
+def _with_optimistix(
+    objective: Objective,
+    u: Any,
+    solver: Any,
+    options: Options,
+    meter: Meter,
+    losses: list[float],
+    movable: np.ndarray,
+) -> Outcome:
     """Step by step through the public methods of the solver, which return what was seen at the
-    point from which they step."""
-    state, losses, meter = _initialize(solver, u, objective), [], _Meter(options)
-    done, okay = False, True
-    with meter.bar:
-        while True:
-            new, state, (loss, solved), new_done, new_okay = _advance(solver, u, objective, state)
-            losses.append(float(loss))
-            meter.advance(losses[-1])
-            if done or not okay or len(losses) > options.steps:
-                break
-            if _stalled(losses, options.patience):
-                done = True
-                break
+    point from which they step. Ends early where a `movable` parameter is driven to a bound."""
+    state, done, okay, message = _initialize(solver, u, objective), False, True, None
+    while message is None:
+        new, state, (loss, solved), new_done, new_okay = _advance(solver, u, objective, state)
+        losses.append(float(loss))
+        meter.advance(losses[-1])
+        if not okay:
+            message = "a linear solve of the optimizer failed"
+        elif done or _stalled(losses, options.patience):
+            message = "converged"
+        elif len(losses) > options.steps:
+            message = f"not converged after {options.steps} steps"
+        elif _flat(losses) and np.any(driven(u, solved, objective) * movable):
+            message = "driven to a bound"
+        else:
             u, done, okay = new, bool(new_done), bool(new_okay)
-    message = "converged" if done else f"not converged after {options.steps} steps"
-    message = message if okay else "a linear solve of the optimizer failed"
-    return Outcome(u, solved, losses, done and okay, message)
+    return Outcome(u, solved, losses, losses[-1], message == "converged", message)
 
 
 def _function_for(solver: Any) -> Callable:
@@ -114,7 +150,14 @@ def _stalled(losses: list[float], patience: int) -> bool:
     return min(losses[-patience:]) > min(losses[:-patience]) * (1 - 1e-9)
 
 
-def _closing_gaps(objective: Objective, u: Any, solver: Any, options: Options) -> Outcome:
+def _flat(losses: list[float]) -> bool:
+    """Whether the last five steps have lowered the loss by less than a hundredth."""
+    return len(losses) > 5 and losses[-6] - losses[-1] <= 0.01 * abs(losses[-6])
+
+
+def _closing_gaps(
+    objective: Objective, u: Any, solver: Any, options: Options, meter: Meter
+) -> Outcome:
     """Multiple shooting: the states at the joints meet in the limit.
 
     An augmented Lagrangian, `sum r^2 + w^2 sum (c + s)^2`: after each fit `s` grows by the gaps
@@ -122,7 +165,7 @@ def _closing_gaps(objective: Objective, u: Any, solver: Any, options: Options) -
     """
     losses = []
     for _ in range(12):
-        found = _with_optimistix(objective, u, solver, options)
+        found = _within_bounds(objective, u, solver, options, meter)
         u, losses = found.u, losses + found.losses
         gap = gaps(objective, found.solved.values)
         size = float(jnp.max(jnp.abs(gap)))
@@ -134,33 +177,37 @@ def _closing_gaps(objective: Objective, u: Any, solver: Any, options: Options) -
             ((objective.shift + gap) / 100, objective.stiffness * 10),
         )
     message = f"gaps of {size:.1e} are left between segments; take shorter ones"
-    return found._replace(losses=losses, success=False, message=message)
+    # Next to others, it is the loss of no trajectory.
+    return found._replace(losses=losses, loss=np.inf, success=False, message=message)
 
 
-def _with_optax(objective: Objective, u: Any, optimizer: Any, options: Options) -> Outcome:
+def _with_optax(
+    objective: Objective, u: Any, optimizer: Any, options: Options, meter: Meter
+) -> Outcome:
     """Epochs of one batch each, or of a random order of all records cut into batches."""
     records, size = objective.pieces.start.size, options.batch_size
-    random, meter = np.random.default_rng(options.seed), _Meter(options)
+    random = np.random.default_rng(options.seed)
     optimizer = optax.with_extra_args_support(optimizer)
     state, losses, best = optimizer.init(u), [], (np.inf, u)
     message = f"all {options.steps} steps taken"
-    with meter.bar:
-        for _ in range(options.steps):
-            batches = [None]
-            if size is not None:
-                batches = np.resize(random.permutation(records), (-(-records // size), size))
-            begin, total = u, 0.0
-            for batch in batches:
-                batch = None if batch is None else jnp.asarray(batch)
+    for _ in range(options.steps):
+        batches = [None]
+        if size is not None:
+            batches = np.resize(random.permutation(records), (-(-records // size), size))
+        begin, total = u, 0.0
+        for batch in batches:
+            batch = None if batch is None else jnp.asarray(batch)
+            with meter.compiling("a step"):
                 u, state, loss = _descend(optimizer, u, state, objective, batch)
-                total += float(loss) / len(batches)
-            losses.append(total)
-            meter.advance(total)
-            best = min(best, (total, begin if size is None else u), key=lambda pair: pair[0])
-            if _stalled(losses, options.patience):
-                message = "the loss decreases no more"
-                break
-    return Outcome(best[1], _solve(best[1], objective), losses, True, message)
+            total += float(loss) / len(batches)
+        losses.append(total)
+        meter.advance(total)
+        best = min(best, (total, begin if size is None else u), key=lambda pair: pair[0])
+        if _stalled(losses, options.patience):
+            message = "the loss decreases no more"
+            break
+    solved = look(best[1], objective, optimizer)[1]
+    return Outcome(best[1], solved, losses, best[0], True, message)
 
 
 @eqx.filter_jit

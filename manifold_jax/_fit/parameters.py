@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 
 
 # exp(50) is 5e21 times the start: beyond it only overflow is left.
-_LARGEST = 50.0
+LARGEST = 50.0
 
 
 class Transform(eqx.Module):
@@ -34,7 +34,7 @@ class Transform(eqx.Module):
         s, has_a, has_b = self.start, jnp.isfinite(self.lower), jnp.isfinite(self.upper)
         # Selected twice, as the derivative of a discarded infinity would be NaN.
         a, b = jnp.where(has_a, self.lower, s - 1), jnp.where(has_b, self.upper, s + 1)
-        v = jnp.clip(u, -_LARGEST, _LARGEST)
+        v = jnp.clip(u, -LARGEST, LARGEST)
         free = s + jnp.where(s == 0, 1, jnp.abs(s)) * u
         above, below = a + (s - a) * jnp.exp(v), b - (b - s) * jnp.exp(-v)
         middle = jnp.log(s - a) - jnp.log(b - s)
@@ -43,13 +43,6 @@ class Transform(eqx.Module):
 
     def parameters(self, u: Float[Array, " p"]) -> Any:
         return self.unravel(self.values(u))
-
-    def at_bounds(self, theta: np.ndarray) -> tuple[str, ...]:
-        """Names of parameters that went all but a thousandth of their way to a bound."""
-        start, hit = np.asarray(self.start), np.zeros(theta.shape, bool)
-        for bound in (np.asarray(self.lower), np.asarray(self.upper)):
-            hit |= np.isfinite(bound) & (np.abs(theta - bound) <= 1e-3 * np.abs(start - bound))
-        return tuple(name for name, at in zip(self.names, hit, strict=True) if at)
 
 
 def make_transform(parameters: Any, bounds: Any, positive: Any) -> Transform:

@@ -2,7 +2,7 @@
 
 from typing import Any
 
-import equinox as eqx
+import jax
 import jax.flatten_util as jfu
 import jax.numpy as jnp
 import jax.tree_util as jtu
@@ -12,9 +12,28 @@ import optimistix as optx
 
 from .data import Records
 from .model import Simulator
-from .objective import Objective, Solved, weighted
+from .objective import Objective
 from .optimize import Options
 from .parameters import Transform
+from .pieces import make_pieces
+
+
+# Unknowns of one trajectory beyond which one reverse sweep is cheaper than a forward sweep for each.
+_MANY_UNKNOWNS = 50
+
+
+def refuse_tracers(**given: Any) -> None:
+    # Inside `jit`, constants turn into tracers as soon as they are used.
+    named = [(f"`{name}` is", value) for name, value in given.items()]
+    for what, value in [*named, ("all numbers are", jnp.zeros(()) + 0)]:
+        if any(isinstance(leaf, jax.core.Tracer) for leaf in jtu.tree_leaves(value)):
+            raise TypeError(
+                f"`fit` cannot be called inside `jax.jit`, `vmap` or a derivative ({what} "
+                "traced there): its loop runs in Python and looks at numbers. Call it outside; its "
+                "steps are compiled, and many trajectories are records of one fit. Inside, write "
+                "your loss with `mj.diffeqsolve`, and take its `jax.grad` or give it to "
+                "`optimistix.least_squares`."
+            )
 
 
 def check_initial(simulator: Simulator, transform: Transform, grid: tuple[int, ...]) -> None:
@@ -49,7 +68,7 @@ def check_options(
         raise ValueError(
             "`segments` (multiple shooting) needs a least-squares optimizer and no `loss`."
         )
-    for name in ("steps", "patience"):
+    for name in ("steps", "patience", "starts"):
         value = getattr(options, name)
         if not isinstance(value, int) or value < 1:
             raise ValueError(f"`{name}` must be a positive whole number, got {value!r}.")
@@ -79,13 +98,16 @@ def check_amount(unknowns: int, objective: Objective) -> None:
 def make_objective(
     simulator: Any,
     transform: Transform,
-    pieces: Any,
     records: Records,
+    segments: int,
+    states: Any,
     fit_initial: bool,
     loss: Any,
     seen: Any,
-    reverse: bool,
+    by_gradient: bool,
 ) -> Objective:
+    pieces = make_pieces(records, segments, simulator, transform, states, fit_initial)
+    reverse = by_gradient and transform.start.size + pieces.basis.shape[-1] > _MANY_UNKNOWNS
     first = np.asarray(pieces.first)
     free = np.flatnonzero(~first | fit_initial)
     joints = np.flatnonzero(~np.roll(first, -1))
@@ -110,19 +132,3 @@ def make_objective(
         records.ts.shape[0],
         reverse,
     )
-
-
-def with_scales(objective: Objective, solved: Solved) -> Objective:
-    """A failed solve counts ten times the largest residual at the start."""
-    failed = np.asarray(solved.values.failed) > 0
-    if np.all(failed):
-        raise ValueError(
-            "`parameters`: every solve from the start values fails (or its derivatives are not "
-            "finite), so that there is nothing to improve. Check them with `mj.diffeqsolve`, "
-            "start elsewhere, or raise `max_steps`."
-        )
-    r = np.asarray(weighted(objective, solved.values))
-    largest = np.max(np.abs(r[~failed]), initial=1.0)
-    data = np.max(np.abs(np.asarray(objective.pieces.weights * objective.pieces.data)))
-    penalty = jnp.asarray(10 * max(largest, data), objective.penalty.dtype)
-    return eqx.tree_at(lambda o: o.penalty, objective, penalty)

@@ -3,6 +3,7 @@
 from typing import NamedTuple
 
 import numpy as np
+import scipy.linalg
 
 
 # Derivatives are as accurate as the solver's tolerance; singular values below this fraction of
@@ -11,8 +12,8 @@ _SINGULAR = 1e-6
 
 
 class Uncertainty(NamedTuple):
-    """Covariance `(N, N)` for noise of size 1, `N - rank` of the unknowns, and the directions
-    `(directions, N)`, scaled to largest component 1, along which nothing changes."""
+    """Covariance `(N, N)` for noise of size 1, of how many unknowns the data tell, and a basis of the
+    directions along which nothing changes, `(directions, N)`, each of few unknowns."""
 
     covariance: np.ndarray
     rank: int
@@ -36,21 +37,37 @@ def gauss_newton(J: np.ndarray, C: np.ndarray) -> Uncertainty:
     if C.size:
         _, s, Vt = np.linalg.svd(C)
         Z = Vt[np.sum(s > 1e-12 * s[0]) :].T
-    _, s, Vt = np.linalg.svd(J @ Z, full_matrices=True)
+    # The triangle has the same singular values, and the size of the unknowns only.
+    _, s, Vt = np.linalg.svd(np.linalg.qr(J @ Z, mode="r"), full_matrices=True)
     s = np.concatenate([s, np.zeros(Vt.shape[0] - s.size)])
     small = s <= _SINGULAR * np.max(s, initial=0.0)
     root = (Z @ Vt.T[:, ~small]) / s[~small] * scale[:, None]
     directions = (Z @ Vt.T[:, small]).T * scale
-    largest = np.argmax(np.abs(directions), axis=1)[:, None]
-    directions = directions / np.take_along_axis(directions, largest, axis=1)
-    return Uncertainty(root @ root.T, int(np.sum(~small)), directions)
+    return Uncertainty(root @ root.T, int(np.sum(~small)), _sparse(directions))
 
 
-def describe(direction: np.ndarray, names: tuple[str, ...]) -> tuple[str, np.ndarray]:
-    """A line for the report, and which of the parameters are involved."""
-    p = len(names)
-    involved = np.abs(direction[:p]) > 0.05
-    parts = [f"{names[i]} ({direction[i]:+.2f})" for i in np.flatnonzero(involved)]
-    if np.any(np.abs(direction[p:]) > 0.05):
+def _sparse(directions: np.ndarray) -> np.ndarray:
+    """Another basis, in which each vector has one unknown for itself: Gauss-Jordan elimination."""
+    count = directions.shape[0]
+    if count == 0:
+        return directions
+    R, order = scipy.linalg.qr(directions, mode="r", pivoting=True)
+    return np.linalg.solve(R[:, :count], R)[:, np.argsort(order)]
+
+
+def describe(
+    direction: np.ndarray, slopes: np.ndarray, names: np.ndarray
+) -> tuple[str, np.ndarray]:
+    """A line for the report, and which of the `p` parameters are involved.
+
+    Involved are those that change by a twentieth of the largest change; numbers are changes of the
+    parameters in their own units (`slopes`: by their unknowns), the largest of them 1."""
+    p, size = len(names), np.max(np.abs(direction))
+    involved = np.abs(direction[:p]) > 0.05 * size
+    change = direction[:p] * slopes
+    largest = np.argmax(np.abs(change) * involved) if p else 0
+    change = change / change[largest] if np.any(involved) else change
+    parts = [f"{names[i]} ({change[i]:+.3g})" for i in np.flatnonzero(involved)]
+    if np.any(np.abs(direction[p:]) > 0.05 * size):
         parts.append("initial states")
     return " with ".join(parts), involved
