@@ -32,20 +32,19 @@ def print_table(output: Console, table: Table) -> None:
 
     Where there is little space its columns move together, and then it is printed in parts,
     each with the first column. Only columns of text, which have a `min_width`, are wrapped.
+    A blank line follows.
     """
     name, *others = table.columns
     for gap in (3, 1):
         if _width(output, table.columns, gap) <= output.width:
-            output.print(_part(table.columns, gap))
+            output.print(_part(table.columns, gap), "")
             return
     while others:
         count = len(others)
         while count > 1 and _width(output, [name, *others[:count]], gap) > output.width:
             count -= 1
-        output.print(_part([name, *others[:count]], gap))
+        output.print(_part([name, *others[:count]], gap), "")
         others = others[count:]
-        if others:
-            output.print()
 
 
 def _width(output: Console, columns: Sequence[Column], gap: int) -> int:
