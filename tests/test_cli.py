@@ -138,15 +138,18 @@ def test_compare_shows_which_methods_keep_the_constraint(comparison):
 def test_compare_prints_what_it_writes(comparison):
     result, path, _ = comparison
     for row in strict_json(path)["rows"]:
-        (line,) = (line for line in result.stdout.splitlines() if row["method"] in line)
-        cells = line.replace(row["method"], "").split()
+        key = next(
+            m.key for m in methods.METHODS if m.label.format(solver="tsit5") == row["method"]
+        )
+        (line,) = (line for line in result.stdout.splitlines() if line.startswith(f"{key} "))
+        cells = line.split()[1:]
         assert cells[0] == str(row["accepted"])
         assert cells[2] == str(row["evaluations"])
         assert cells[4] == f"{row['violation_output']:.1e}"
         assert cells[5] == f"{row['error']:.1e}"
     assert "Step limit chosen for Diffrax: 4096" in result.stdout
     assert "(invariant, exact) with gain 1 per unit of time" in result.stdout
-    assert "Left out: baumgarte tsit5, which needs a mechanical system" in result.stdout
+    assert "Left out: baumgarte, which needs a mechanical system" in result.stdout
 
 
 def test_compare_draws_a_picture(comparison):
@@ -314,7 +317,8 @@ def test_compare_reports_failures_in_their_row(monkeypatch, tmp_path):
     *failed, scipy = content["rows"]
     assert all(set(row.values()) == {row["method"], None} for row in failed)
     assert scipy["error"] < 1e-4
-    assert "failed: no hope" in result.stdout
+    assert "plain failed: not finished after 4 steps" in result.stdout
+    assert "hopeless failed: no hope" in result.stdout
     assert "<svg" in picture.read_text()
 
 
@@ -369,7 +373,12 @@ def test_every_method_is_in_the_help_and_has_a_style():
         (("pendulum", "--t1", "0"), "must be later than the start of `pendulum`, t0 = 0"),
         (("arevalo", "--t1", "0.5"), "t0 = 1; got 0.5"),
         (("pendulum", "--plot", "picture.gif"), "must end in one of: .png"),
-        (("pendulum", "--json", "no/such/folder/rows.json"), "cannot write the file"),
+        (("pendulum", "--json", "no/such/folder/rows.json"), "No such file or directory"),
+        (("pendulum", "--plot", "."), "must end in one of: .png"),
+        (("pendulum", "--json", "."), "cannot write the file '.': Is a directory"),
+        # what only an attempt to write it can tell, also of folders without permission
+        (("pendulum", "--json", "a" * 300), "File name too long"),
+        (("pendulum", "--plot", f"{'a' * 300}.png"), "File name too long"),
     ],
 )
 def test_mistakes_are_explained(arguments, message):
@@ -378,6 +387,15 @@ def test_mistakes_are_explained(arguments, message):
     text = unframed(result.output)
     assert message in text
     assert "Traceback" not in text
+
+
+def test_looking_whether_files_can_be_written_leaves_nothing_behind(tmp_path):
+    new, old = tmp_path / "new.json", tmp_path / "old.json"
+    old.write_text("kept")
+    for path in (new, old):
+        assert run("compare", "pendulum", "--json", path, "--plot", "x.gif").exit_code == 2
+    assert not new.exists()
+    assert old.read_text() == "kept"
 
 
 # paper

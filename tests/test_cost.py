@@ -1,4 +1,4 @@
-"""METHODS 10.10: what a correction costs in evaluations, counted while the solve runs."""
+"""What a correction costs in evaluations, counted while the solve runs."""
 
 import collections
 

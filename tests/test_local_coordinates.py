@@ -68,7 +68,8 @@ def step_of_library(y0, h, chart):
 
 @pytest.mark.parametrize("rotated", [0.0, 0.9])
 def test_one_step_equals_the_form_with_a_basis(rotated):
-    """METHODS 10.6: independent of the basis, with the error estimate of rule A."""
+    """Independent of the basis; an error `e` of the coordinates is one of `Phi'(u) e` of the
+    state, for a chart `Phi`."""
     y0 = unit_start()
     G = 2 * y0 / AXES**2
     U = scipy.linalg.null_space(G[None, :])
@@ -92,7 +93,7 @@ def test_one_step_equals_coordinate_partitioning():
 
 
 def test_error_tolerances_in_coordinates():
-    """METHODS 10.6, rule B: |du_j| <= min_i tol_i / (d |U_ij|) keeps |dx_i| <= tol_i."""
+    """In d coordinates, |du_j| <= min_i tol_i / (d |U_ij|) keeps |dx_i| <= tol_i."""
     rng = np.random.default_rng(0)
     y0 = unit_start()
     U = scipy.linalg.null_space((2 * y0 / AXES**2)[None, :])

@@ -56,7 +56,8 @@ def dense_solution(M, q, v, t):
     ids=["scalar", "diagonal", "like q", "matrix"],
 )
 def test_accelerations_and_multipliers_solve_the_dense_system(mass, matrix):
-    """METHODS 10.7."""
+    """`M a + J^T lambda = Q` with the constraint differentiated twice, of which the library
+    eliminates `a`."""
     system = mj.MechanicalSystem(mass, two_rods, weight)
     q, v = map(np.asarray, STATE)
     a, multipliers = dense_solution(matrix(q), q, v, 0.7)
@@ -113,7 +114,7 @@ def test_large_systems_use_the_library_and_agree():
 
 
 def test_velocity_correction_is_orthogonal_in_the_metric_of_the_masses():
-    """METHODS 10.7: J v = 0, and the kinetic energy is not increased."""
+    """J v = 0, and the kinetic energy is not increased."""
     system = mj.MechanicalSystem(mass_matrix, two_rods, weight)
     q, _ = STATE
     v = jnp.asarray(np.random.default_rng(0).normal(size=(2, 2)))
@@ -404,7 +405,7 @@ def drift(terms, solver, ts, y0, **options):
 
 
 def test_drift_exponents():
-    """METHODS 10.5: index 1 drifts off 4 times as far per doubling of the time, the projected
+    """Index 1 drifts off 4 times as far per doubling of the time, the projected
     field 2 times, projection stays at round-off."""
     y0 = (jnp.array([1.0, 0.0]), jnp.zeros(2))
     ts = np.array([8.0, 16.0, 32.0, 64.0])

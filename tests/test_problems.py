@@ -12,7 +12,12 @@ import pytest
 import scipy.integrate
 
 from manifold_jax import problems
-from manifold_jax.problems.lotka_volterra import END, PUBLISHED_END
+from manifold_jax.problems.lotka_volterra import (
+    COST_BY_RATES,
+    COST_BY_START,
+    END,
+    PUBLISHED_END,
+)
 from manifold_jax.problems.pendulum import A01_X, A01_Y
 
 
@@ -440,24 +445,44 @@ def test_kepler_standard_orbit():
     np.testing.assert_allclose(v, [0.0, -np.sqrt(2.0 * 0.7 / 1.3)], rtol=0, atol=1e-14)
 
 
-def lotka_volterra_by_taylor_series(order=30, steps=100, digits=40):
-    """(x, y) at t = 10: an independent method in higher precision."""
-    with decimal.localcontext(prec=digits):
-        p0, p1, p2, p3 = (decimal.Decimal(p) for p in ("1.5", "1", "3", "1"))
-        x = y = decimal.Decimal(1)
-        h = decimal.Decimal(10) / steps
-        for _ in range(steps):
-            xs, ys = [x], [y]
-            for k in range(order):
-                product = sum(a * b for a, b in zip(xs, reversed(ys), strict=True))
-                xs.append((p0 * xs[k] - p1 * product) / (k + 1))
-                ys.append((p3 * product - p2 * ys[k]) / (k + 1))
-            x = sum(a * h**k for k, a in enumerate(xs))
-            y = sum(b * h**k for k, b in enumerate(ys))
-        return float(x), float(y)
+def lotka_volterra_by_taylor_series(
+    start=("1", "1"), rates=("1.5", "1", "3", "1"), order=30, steps=100
+):
+    """(x, y) at t = 10: an independent method in the precision of the context."""
+    p0, p1, p2, p3 = map(decimal.Decimal, rates)
+    x, y = map(decimal.Decimal, start)
+    h = decimal.Decimal(10) / steps
+    for _ in range(steps):
+        xs, ys = [x], [y]
+        for k in range(order):
+            product = sum(a * b for a, b in zip(xs, reversed(ys), strict=True))
+            xs.append((p0 * xs[k] - p1 * product) / (k + 1))
+            ys.append((p3 * product - p2 * ys[k]) / (k + 1))
+        x = sum(a * h**k for k, a in enumerate(xs))
+        y = sum(b * h**k for k, b in enumerate(ys))
+    return x, y
 
 
 def test_lotka_volterra_end():
-    np.testing.assert_allclose(END, lotka_volterra_by_taylor_series(), rtol=2e-16, atol=0)
+    with decimal.localcontext(prec=40):
+        end = [float(value) for value in lotka_volterra_by_taylor_series()]
+    np.testing.assert_allclose(END, end, rtol=2e-16, atol=0)
     # SUNDIALS prints 16 digits of which 11 are right
     np.testing.assert_allclose(END, PUBLISHED_END, rtol=0, atol=5e-12)
+
+
+def test_lotka_volterra_cost_gradient():
+    """Differences in 40 digits: their errors are of the size 1e-24."""
+
+    def cost(data):
+        end = lotka_volterra_by_taylor_series(data[:2], data[2:])
+        return sum((1 - value) ** 2 for value in end) / 2
+
+    with decimal.localcontext(prec=40):
+        h = decimal.Decimal("1e-12")
+        standard = [decimal.Decimal(value) for value in ("1", "1", "1.5", "1", "3", "1")]
+        moved = lambda i, h: [value + h * (i == k) for k, value in enumerate(standard)]
+        slopes = [(cost(moved(i, h)) - cost(moved(i, -h))) / (2 * h) for i in range(6)]
+    np.testing.assert_allclose(
+        [*COST_BY_START, *COST_BY_RATES], [float(s) for s in slopes], rtol=3e-16, atol=0
+    )

@@ -1,59 +1,31 @@
-"""The README's example runs and does what the text says."""
+"""The README's examples run and do what the text says, each alone and one after the other."""
 
+import ast
+import builtins
 import re
 from pathlib import Path
 
-import diffrax
 import jax
 import numpy as np
 import pytest
 
-import manifold_jax
-
 
 README = Path(__file__).parents[1] / "README.md"
+BLOCKS = re.findall(r"```python\n(.*?)```", README.read_text(), flags=re.DOTALL)
+# What the others need of the first one, as the text says: the imports and the setting.
+PREAMBLE = BLOCKS[0].split("\n\n\n")[0]
+NAMES = ["fifteen lines", "mechanism", "curves and minima", "fit"]
 
 
-def blocks():
-    return re.findall(r"```python\n(.*?)```", README.read_text(), flags=re.DOTALL)
-
-
-@pytest.fixture
-def example():
-    return blocks()[0]
-
-
-def test_mechanism_example_runs():
+def run(*blocks):
+    namespace = {}
     with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
-        namespace = {"jax": jax, "jnp": jax.numpy, "dfx": diffrax, "mj": manifold_jax}
-        exec(compile(blocks()[1], str(README), "exec"), namespace)
-    q = np.asarray(namespace["sol"].ys[0][-1])
-    np.testing.assert_allclose(np.linalg.norm([q[0], q[1] - q[0]], axis=1), 1, atol=1e-15)
-    assert namespace["forces"].shape == (2,)
+        for block in blocks:
+            exec(compile(block, str(README), "exec"), namespace)
+    return namespace
 
 
-def test_curves_and_minima_example_runs():
-    with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
-        namespace = {"jnp": jax.numpy, "mj": manifold_jax}
-        exec(compile(blocks()[2], str(README), "exec"), namespace)
-    np.testing.assert_allclose(namespace["folds"], [[-1, -2 / 3], [1, 2 / 3]], atol=1e-14)
-    np.testing.assert_allclose(namespace["minimum"].x, [-1, 0, 0], atol=1e-14)
-    np.testing.assert_allclose(namespace["minimum"].multipliers, [0.5], rtol=1e-14)
-
-
-def test_fit_example_runs():
-    with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
-        namespace = {"jax": jax, "jnp": jax.numpy, "mj": manifold_jax}
-        exec(compile(blocks()[3], str(README), "exec"), namespace)
-    fit = namespace["fit"]
-    assert abs(fit.parameters["gravity"] - 9.81) < 3 * fit.standard_errors["gravity"] < 0.02
-    assert abs(fit.parameters["length"] - 1) < 3 * fit.standard_errors["length"] < 0.002
-
-
-def test_example_runs_and_keeps_the_manifold(example):
-    with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
-        namespace = {}
-        exec(compile(example, str(README), "exec"), namespace)
+def check_fifteen_lines(namespace):
     q, v = namespace["sol"].ys
     assert np.abs(np.sum(np.square(q), axis=-1) - 1).max() <= 1e-15
     assert np.abs(np.sum(q * v, axis=-1)).max() <= 2e-15
@@ -61,8 +33,67 @@ def test_example_runs_and_keeps_the_manifold(example):
     assert abs(namespace["slope"] + 2.12823553) <= 1e-5
 
 
-def test_example_is_short(example):
-    assert len([line for line in example.splitlines() if line.strip()]) <= 16
+def check_mechanism(namespace):
+    q = np.asarray(namespace["motion"].ys[0][-1])
+    np.testing.assert_allclose(np.linalg.norm([q[0], q[1] - q[0]], axis=1), 1, atol=1e-15)
+    assert namespace["forces"].shape == (2,)
+
+
+def check_curves_and_minima(namespace):
+    np.testing.assert_allclose(namespace["folds"], [[-1, -2 / 3], [1, 2 / 3]], atol=1e-14)
+    np.testing.assert_allclose(namespace["minimum"].x, [-1, 0, 0], atol=1e-14)
+    np.testing.assert_allclose(namespace["minimum"].multipliers, [0.5], rtol=1e-14)
+
+
+def check_fit(namespace):
+    fit = namespace["fit"]
+    assert abs(fit.parameters["gravity"] - 9.81) < 3 * fit.standard_errors["gravity"] < 0.02
+    assert abs(fit.parameters["length"] - 1) < 3 * fit.standard_errors["length"] < 0.002
+
+
+CHECKS = (check_fifteen_lines, check_mechanism, check_curves_and_minima, check_fit)
+
+
+@pytest.mark.parametrize("i", range(len(BLOCKS)), ids=NAMES)
+def test_each_example_runs_alone(i):
+    CHECKS[i](run(PREAMBLE, BLOCKS[i]))
+
+
+def names_of(block):
+    """All names that are read, those that are bound at the top level, and all that are bound."""
+    nodes = list(ast.walk(ast.parse(block)))
+    read = {n.id for n in nodes if isinstance(n, ast.Name) and isinstance(n.ctx, ast.Load)}
+    bound = {n.id for n in nodes if isinstance(n, ast.Name) and isinstance(n.ctx, ast.Store)}
+    bound |= {n.name for n in nodes if isinstance(n, ast.FunctionDef | ast.ClassDef)}
+    bound |= {n.arg for n in nodes if isinstance(n, ast.arg)}
+    bound |= {n.asname or n.name for n in nodes if isinstance(n, ast.alias)}
+    top = set(compile(block, str(README), "exec").co_names) & bound
+    return read, top, bound
+
+
+def test_examples_do_not_depend_on_each_other():
+    """So that what holds for each alone holds for all in one session, in any order."""
+    imported = names_of(PREAMBLE)[2]
+    owner = {}
+    for name, block in zip(NAMES, BLOCKS):
+        read, top, bound = names_of(block)
+        assert read <= bound | imported | set(dir(builtins)), name
+        for binding in top - imported:
+            assert owner.setdefault(binding, name) == name, binding
+
+
+@pytest.mark.slow
+def test_examples_run_one_after_the_other():
+    namespace = run(*BLOCKS)
+    for check in CHECKS:
+        check(namespace)
+    # what the first one defined still means the same
+    exec("again = solve(9.81, dfx.SaveAt(t1=True)).ys", namespace)
+    np.testing.assert_allclose(namespace["again"][0][-1], namespace["sol"].ys[0][-1], rtol=1e-12)
+
+
+def test_first_example_is_short():
+    assert len([line for line in BLOCKS[0].splitlines() if line.strip()]) <= 16
 
 
 def test_commands_are_there():

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import manifold_jax as mj
+from manifold_jax.problems.lotka_volterra import COST_BY_RATES, COST_BY_START
 from manifold_jax.problems.pendulum import A01_X, A01_Y
 
 
@@ -133,3 +134,16 @@ def test_long_run(name):
         if label == "projected":
             assert violation <= 5e-15
     assert errors["projected"] <= errors["plain"]
+
+
+def test_lotka_volterra_cost_gradient_to_eleven_digits():
+    """With respect to start and rates, both also in the invariant."""
+
+    def cost(start, rates):
+        problem = mj.problems.lotka_volterra().with_args(rates).with_initial(start)
+        return jnp.sum((1 - solve(problem, 1e-13).ys[0]) ** 2) / 2
+
+    problem = mj.problems.lotka_volterra()
+    slopes = jax.jit(jax.grad(cost, (0, 1)))(problem.y0, problem.args)
+    np.testing.assert_allclose(slopes[0], COST_BY_START, rtol=1e-11)
+    np.testing.assert_allclose(slopes[1], COST_BY_RATES, rtol=1e-11)

@@ -80,7 +80,7 @@ def end(problem, stabilization, t0, t1, y0):
 @pytest.mark.parametrize("name", PROBLEMS)
 @pytest.mark.parametrize("backward", [False, True])
 def test_projected_invariant_stabilization_decays_exponentially(name, backward):
-    """METHODS 10.4: |g(1)| / |g(0)| = exp(-3), forward and backward."""
+    """`g' = -gain g` where the field is tangent: |g(1)| / |g(0)| = exp(-3), either way in time."""
     problem = build(name)
     y0 = start_off(problem, 1e-3)
     t1 = problem.t0 - SPAN if backward else problem.t0 + SPAN
@@ -91,7 +91,7 @@ def test_projected_invariant_stabilization_decays_exponentially(name, backward):
 
 @pytest.mark.parametrize("name", ["rigid-body", "kepler", "sphere-flow"])
 def test_exact_stabilization_decays_exponentially(name):
-    """METHODS 10.4, for the distance from the manifold."""
+    """The distance from the manifold decays at the rate of the gain."""
     problem = mj.problems.ALL[name]()
     y0 = start_off(problem, 3e-4)
     y1 = end(problem, DECAYING["exact"], problem.t0, problem.t0 + SPAN, y0)

@@ -3,7 +3,7 @@
 import dataclasses
 import time
 from collections.abc import Callable, Iterable, Iterator
-from typing import Any
+from typing import Any, Literal, NamedTuple
 
 import diffrax as dfx
 import jax
@@ -36,16 +36,17 @@ class Check:
     """One way to the gradient: how far it is from forward mode (relative, largest component),
     and what it cost. `refused` is the message of an adjoint that was refused, instead.
 
+    - `difference`: of the gradient.
+    - `batch`: of `vmap` of the gradient, for two sets of parameters.
     - `hessian`: of a Hessian-vector product, from forward over forward mode; `None` if it was
-        refused.
-    - `batch`: of `vmap(grad)` from one at a time.
+        not asked for.
     - `memory`: temporary bytes of the compiled gradient.
     """
 
     adjoint: str
     difference: float | None = None
-    hessian: float | None = None
     batch: float | None = None
+    hessian: float | Literal["refused"] | None = None
     run_ms: float | None = None
     compile_s: float | None = None
     memory: int | None = None
@@ -56,8 +57,7 @@ class Check:
 class Combination:
     """An approach and a solver.
 
-    - `value_ms`: time of the solve alone.
-    - `differences`: of finite differences from forward mode.
+    - `differences`: of finite differences from forward mode, both with the same steps.
     - `exact`: of the gradient of the exact solution from forward mode, `None` if not known.
     - `tangency`: the largest derivative of the residual at the end, relative to that of the
         state.
@@ -67,7 +67,6 @@ class Combination:
     approach: str
     solver: str
     steps: int = 0
-    value_ms: float | None = None
     differences: float | None = None
     exact: float | None = None
     tangency: float | None = None
@@ -75,67 +74,82 @@ class Combination:
     failure: str | None = None
 
 
+class _Forward(NamedTuple):
+    """What forward mode says.
+
+    - `parameters`: several sets, of which the first is that of the problem.
+    - `gradients`: for each of them.
+    - `direction`, `curvature`: the Hessian times a vector, for the first, if asked for.
+    """
+
+    parameters: Any
+    gradients: list[np.ndarray]
+    direction: Any
+    curvature: np.ndarray | None
+
+
 def combinations(
     task: Task,
     approaches: Iterable[Approach],
     solvers: Iterable[dfx.AbstractSolver],
     adjoints: dict[str, dfx.AbstractAdjoint],
+    hessian: bool,
 ) -> Iterator[tuple[str, Combination | None]]:
     """What is being compared, and the result once it is known, in turn."""
     solvers = list(solvers)
     for approach in approaches:
         for solver in solvers:
-            solver_name = type(solver).__name__
-            yield f"{approach.name}, {solver_name}", None
-            if approach.needs_system and task.problem.system is None:
-                failure = "needs a mechanical system"
-            else:
-                try:
-                    case = Case.build(task.problem, approach, solver, task.gain, task.t1, task.rtol)
-                    yield f"{approach.name}, {solver_name}", certify(case, adjoints)
-                    continue
-                except RuntimeError as error:
-                    failure = str(error)
-            yield "", Combination(approach.name, solver_name, failure=failure)
+            names = approach.name, type(solver).__name__
+            yield ", ".join(names), None
+            try:
+                case = Case.build(task.problem, approach, solver, task.gain, task.t1, task.rtol)
+                yield ", ".join(names), certify(case, adjoints, hessian)
+            except RuntimeError as error:
+                yield ", ".join(names), Combination(*names, failure=str(error))
 
 
-def certify(case: Case, adjoints: dict[str, dfx.AbstractAdjoint]) -> Combination:
+def certify(case: Case, adjoints: dict[str, dfx.AbstractAdjoint], hessian: bool) -> Combination:
     """Compare the gradients of one approach and solver."""
-    theta = case.theta
     if not case.is_corrected:  # then it is Diffrax's own approximation, of another kind
         adjoints = {name: a for name, a in adjoints.items() if name != REFUSED}
-    forward = _gradient(case, "forward", ADJOINTS["forward"])
-    reference = np.asarray(jax.jit(forward)(theta))
-    direction = jnp.cos(2 + jnp.arange(theta.size, dtype=theta.dtype)) * theta
-    curvature = np.asarray(_along(forward, direction)(theta))
-    value = jax.jit(case.objective(dfx.RecursiveCheckpointAdjoint()))
-    by_differences = differences(lambda x: float(value(jnp.asarray(x))), np.asarray(theta))
+    parameters = jnp.stack([case.theta, 1.001 * case.theta])
+    outcome = jax.jit(
+        jax.jacfwd(lambda theta: case.outcome(theta, ADJOINTS["forward"], case.adaptive))
+    )
+    (_, states, residuals), _ = outcomes = [outcome(theta) for theta in parameters]
+    gradients = [np.asarray(gradient) for gradient, *_ in outcomes]
+    direction, curvature = _direction(case.theta), None
+    if hessian:
+        by_forward = _gradient(case, "forward", ADJOINTS["forward"])
+        curvature = np.asarray(_along(by_forward, direction)(case.theta))
+    forward = _Forward(parameters, gradients, direction, curvature)
     exact = case.exact_gradient()
-    tangents = jax.jit(jax.jacfwd(lambda x: case.residual(x, dfx.ForwardMode())))(theta)
-    states = jax.jit(jax.jacfwd(lambda x: case.end(x, dfx.ForwardMode())))(theta)
     return Combination(
         case.approach.name,
-        type(case.solver).__name__,
-        len(case.steps) - 1,
-        median_ms(lambda: jax.block_until_ready(value(theta))),
-        _relative(by_differences, reference),
-        None if exact is None else _relative(exact, reference),
-        float(jnp.max(jnp.abs(tangents)) / jnp.max(jnp.abs(states))),
-        tuple(
-            _check(case, name, adjoint, reference, direction, curvature)
-            for name, adjoint in adjoints.items()
-        ),
+        type(case.adaptive.solver).__name__,
+        case.frozen.max_steps,
+        _by_differences(case),
+        None if exact is None else _relative(exact, gradients[0]),
+        float(jnp.max(jnp.abs(residuals)) / jnp.max(jnp.abs(states))),
+        tuple(_check(case, name, adjoint, forward) for name, adjoint in adjoints.items()),
     )
 
 
-def _check(
-    case: Case,
-    name: str,
-    adjoint: dfx.AbstractAdjoint,
-    reference: np.ndarray,
-    direction: Any,
-    curvature: np.ndarray,
-) -> Check:
+def _by_differences(case: Case) -> float:
+    """How far finite differences are from forward mode, with the same steps."""
+
+    @jax.jit
+    def value_and_gradient(theta):
+        value = lambda x: 2 * (case.objective(x, ADJOINTS["forward"], case.frozen),)
+        gradient, value = jax.jacfwd(value, has_aux=True)(theta)
+        return value, gradient
+
+    value = lambda theta: float(value_and_gradient(jnp.asarray(theta))[0])
+    gradient = np.asarray(value_and_gradient(case.theta)[1])
+    return _relative(differences(value, np.asarray(case.theta)), gradient)
+
+
+def _check(case: Case, name: str, adjoint: dfx.AbstractAdjoint, forward: _Forward) -> Check:
     theta = case.theta
     gradient = jax.jit(_gradient(case, name, adjoint))
     start = time.perf_counter()
@@ -145,16 +159,12 @@ def _check(
         return Check(name, refused=str(error).strip().splitlines()[0])
     compile_s = time.perf_counter() - start
     analysis = compiled.memory_analysis()
-    several = jnp.stack([theta, 1.001 * theta, 0.999 * theta])
-    batch = jax.jit(jax.vmap(gradient))(several)
+    batch = np.asarray(jax.jit(jax.vmap(gradient))(forward.parameters))
     return Check(
         name,
-        difference=_relative(np.asarray(compiled(theta)), reference),
-        hessian=_hessian_difference(gradient, theta, direction, curvature),
-        batch=max(
-            _relative(np.asarray(b), np.asarray(gradient(x)))
-            for b, x in zip(batch, several, strict=True)
-        ),
+        difference=_relative(np.asarray(compiled(theta)), forward.gradients[0]),
+        batch=float(np.max([*map(_relative, batch, forward.gradients)])),
+        hessian=_hessian_difference(gradient, theta, forward),
         run_ms=median_ms(lambda: jax.block_until_ready(compiled(theta))),
         compile_s=compile_s,
         memory=None if analysis is None else int(analysis.temp_size_in_bytes),
@@ -162,18 +172,21 @@ def _check(
 
 
 def _hessian_difference(
-    gradient: Callable[[Any], Any], theta: Any, direction: Any, curvature: np.ndarray
-) -> float | None:
-    try:
-        found = _along(gradient, direction)(theta)
-    except (TypeError, ValueError):  # of JAX or Equinox: cannot be differentiated forwards
+    gradient: Callable[[Any], Any], theta: Any, forward: _Forward
+) -> float | Literal["refused"] | None:
+    if forward.curvature is None:
         return None
-    return _relative(np.asarray(found), curvature)
+    try:
+        found = _along(gradient, forward.direction)(theta)
+    except (TypeError, ValueError):  # of JAX or Equinox: cannot be differentiated forwards
+        return "refused"
+    return _relative(np.asarray(found), forward.curvature)
 
 
 def _gradient(case: Case, name: str, adjoint: dfx.AbstractAdjoint) -> Callable[[Any], Any]:
+    """As users compute it: the steps are chosen anew."""
     transform = jax.jacfwd if name == "forward" else jax.grad
-    return transform(case.objective(adjoint))
+    return transform(lambda theta: case.objective(theta, adjoint, case.adaptive))
 
 
 def _along(gradient: Callable[[Any], Any], direction: Any) -> Callable[[Any], Any]:
@@ -183,3 +196,7 @@ def _along(gradient: Callable[[Any], Any], direction: Any) -> Callable[[Any], An
 
 def _relative(a: np.ndarray, b: np.ndarray) -> float:
     return float(np.max(np.abs(a - b)) / np.max(np.abs(b)))
+
+
+def _direction(theta: Any) -> Any:
+    return jnp.cos(2 + jnp.arange(theta.size, dtype=theta.dtype)) * theta

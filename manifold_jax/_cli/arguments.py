@@ -3,14 +3,17 @@
 import math
 from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 import typer
 
 
 if TYPE_CHECKING:
+    from .._compare.approaches import Approach
     from .._compare.methods import Method
     from .._compare.task import Task
+
+    Way = TypeVar("Way", Approach, Method)
 
 
 # What matplotlib writes without further programs.
@@ -32,8 +35,7 @@ def task_for(
     built = ALL[problem]()
     gain = default_gain(built) if gain is None else gain
     for name, value in (("--rtol", rtol), ("--atol", atol), ("--gain", gain)):
-        if not (math.isfinite(value) and value > 0):
-            raise typer.BadParameter(f"must be a positive number, got {value}.", param_hint=name)
+        check_positive(value, name)
     t1 = built.t1 if t1 is None else t1
     if not (math.isfinite(t1) and t1 > built.t0):
         raise typer.BadParameter(
@@ -43,14 +45,13 @@ def task_for(
     return Task(built, solver, rtol, atol, t1, gain)
 
 
-def choose(names: str | None, task: "Task") -> tuple[list["Method"], list["Method"]]:
+def choose(
+    names: str | None, known: dict[str, "Way"], task: "Task"
+) -> tuple[list["Way"], list["Way"]]:
     """Of the methods asked for, those that can solve the task, and those that cannot."""
-    from .._compare.methods import METHODS
-
-    known = [method.key for method in METHODS]
-    asked = known if names is None else names_in(names, known, "method", "--methods")
-    methods = [method for method in METHODS if method.key in asked]
-    chosen = [method for method in methods if method.applies_to(task)]
+    asked = list(known) if names is None else names_in(names, known, "method", "--methods")
+    methods = [method for name, method in known.items() if name in asked]
+    chosen = [m for m in methods if task.problem.system is not None or not m.needs_system]
     if not chosen:
         raise typer.BadParameter(
             f"{', '.join(asked)} needs a mechanical system, which `{task.problem.name}` is not.",
@@ -74,13 +75,25 @@ def check_name(name: str, known: Iterable[str], kind: str, hint: str) -> None:
         )
 
 
+def check_positive(value: float, option: str) -> None:
+    if not (math.isfinite(value) and value > 0):
+        raise typer.BadParameter(f"must be a positive number, got {value}.", param_hint=option)
+
+
 def check_target(path: Path | None, option: str, suffixes: tuple[str, ...] | None) -> None:
     """Say so before the computation if its result could not be written."""
     if path is None:
         return
-    if path.is_dir() or not path.parent.is_dir():
-        raise typer.BadParameter(f"cannot write the file {str(path)!r}.", param_hint=option)
     if suffixes is not None and path.suffix.lower() not in suffixes:
         raise typer.BadParameter(
             f"{str(path)!r} must end in one of: {', '.join(suffixes)}.", param_hint=option
         )
+    try:
+        existed = path.exists()
+        path.open("ab").close()
+        if not existed:
+            path.unlink()
+    except OSError as error:
+        raise typer.BadParameter(
+            f"cannot write the file {str(path)!r}: {error.strerror}.", param_hint=option
+        ) from error

@@ -33,9 +33,6 @@ class Method:
     def name(self, task: Task) -> str:
         return self.label.format(solver=task.solver)
 
-    def applies_to(self, task: Task) -> bool:
-        return task.problem.system is not None or not self.needs_system
-
 
 # In the order of the tables.
 METHODS: tuple[Method, ...] = (

@@ -13,7 +13,6 @@ from typing import NamedTuple
 import diffrax as dfx
 import jax.numpy as jnp
 import numpy as np
-from rich import box
 from rich.table import Table
 
 from .._diffeqsolve import diffeqsolve
@@ -23,6 +22,7 @@ from ..problems import harmonic_oscillator
 
 TAUS = tuple(10.0**-k for k in range(1, 9))
 
+TITLE = "Euler's method on the circle, one turn (Sudarsan & Keerthi 1998, Example 2.1)"
 NOTES = (
     "Local tolerance tau, N steps of size h = sqrt(2 tau); "
     "without projection g(x_N) = (1 + 2 tau)^N - 1.",
@@ -103,12 +103,7 @@ def _euler(solver: dfx.AbstractSolver, h: float, N: int, limit: int) -> np.ndarr
 
 
 def paper_table(rows: list[PaperRow]) -> Table:
-    table = Table(
-        box=box.SIMPLE,
-        pad_edge=False,
-        title="Euler's method on the circle, one turn (Sudarsan & Keerthi 1998, Example 2.1)",
-        title_justify="left",
-    )
+    table = Table()
     for heading in (
         "\ntau",
         "\nh",
@@ -120,7 +115,7 @@ def paper_table(rows: list[PaperRow]) -> Table:
         "projected\nerror",
         "\ngain",
     ):
-        table.add_column(heading, justify="right", no_wrap=True)
+        table.add_column(heading, justify="right")
     for row in rows:
         table.add_row(*(shown(value) for shown, value in zip(_FORMATS, row, strict=True)))
     return table

@@ -14,7 +14,6 @@ import jax.flatten_util as jfu
 import jax.tree_util as jtu
 import numpy as np
 import scipy
-from rich import box
 from rich.markup import escape
 from rich.table import Table
 
@@ -39,13 +38,13 @@ def sizes(problem: Problem) -> tuple[int, int]:
 
 
 def gallery_table(gallery: dict[str, Callable[[], Problem]]) -> Table:
-    table = Table(box=box.SIMPLE, pad_edge=False)
-    table.add_column("name", no_wrap=True)
+    table = Table()
+    table.add_column("name")
     table.add_column("n", justify="right")
     table.add_column("m", justify="right")
-    table.add_column("time span", no_wrap=True)
-    table.add_column("solution", no_wrap=True)
-    table.add_column("description")
+    table.add_column("time span")
+    table.add_column("solution")
+    table.add_column("description", min_width=20)  # the only one to be wrapped
     for name, build in gallery.items():
         problem = build()
         table.add_row(
@@ -65,32 +64,36 @@ def summary(build: Callable[[], Problem]) -> str:
     return re.split(r"[,:.]( |$)", text, maxsplit=1)[0].replace("$", "")
 
 
-def comparison_table(task: Task, measurements: Sequence[Measurement]) -> Table:
-    table = Table(box=box.SIMPLE, pad_edge=False)
-    table.add_column("method", no_wrap=True)
+def comparison_title(task: Task) -> str:
+    span = f"t = {task.t0:g} to {task.t1:g}"
+    return f"{task.problem.name}, {task.solver}, {span}, rtol = {task.rtol:g}, atol = {task.atol:g}"
+
+
+def comparison_table(measurements: Sequence[Measurement]) -> Table:
+    table = Table()
+    table.add_column("method")
+    # short, so that they fit in a terminal of 80 columns
     for heading in (
         "steps\naccepted",
         "\nrejected",
-        "field\nevaluations",
-        "max |g|\nat steps",
-        "max |g|\nat output",
-        "max error\nof state",
+        "field\ncalls",
+        "|g| at\nsteps",
+        "|g| at\noutput",
+        "error of\nstate",
         "run\n(ms)",
         "compile\n(s)",
     ):
         table.add_column(heading, justify="right")
     for measurement in measurements:
-        row, failure = measurement.row, measurement.failure
+        row = measurement.row
         table.add_row(
-            row.method,
+            measurement.key,
             _number(row.accepted, "d"),
             _number(row.rejected, "d"),
             _number(row.evaluations, "d"),
             _number(row.violation_steps, ".1e"),
             _number(row.violation_output, ".1e"),
-            _number(row.error, ".1e")
-            if failure is None
-            else f"[red]failed: {escape(failure)}[/red]",
+            _number(row.error, ".1e") if measurement.failure is None else "failed",
             _number(row.run_ms, ".3g" if (row.run_ms or 0) < 100 else ".0f"),
             _number(row.compile_s, ".2f"),
         )
@@ -111,8 +114,10 @@ def comparison_notes(
         known = f"is known at t = {task.t1:g} only: error there"
     else:
         known = "is known"
+    failures = [f"{m.key} failed: {m.failure}." for m in measurements if m.failure is not None]
     notes = [
-        f"Output at {OUTPUT_POINTS} times; the solution {known}.",
+        *failures,
+        f"Largest |g| and error; output at {OUTPUT_POINTS} times; the solution {known}.",
         "Run: median, output included. SciPy calls the compiled field from Python and does not "
         "report rejected steps.",
     ]
@@ -123,7 +128,7 @@ def comparison_notes(
             "its states are handed out uncorrected."
         )
     for method in left_out:
-        notes.append(f"Left out: {method.name(task)}, which {NEEDS_SYSTEM}.")
+        notes.append(f"Left out: {method.key}, which {NEEDS_SYSTEM}.")
     limit = max_steps(measurements)
     return notes if limit is None else [*notes, f"Step limit chosen for Diffrax: {limit}."]
 

@@ -26,6 +26,15 @@ class LotkaVolterraArgs(NamedTuple):
 PUBLISHED_END = (1.026344767571517, 9.096910781383605e-1)
 # The same to 16 digits: Taylor series of order 30, step 0.1, in 40-digit arithmetic.
 END = (1.02634476757508932, 0.909691078136041618)
+# Derivatives of `|1 - y(10)|^2 / 2` with respect to the initial state and the rates, in the
+# same way.
+COST_BY_START = (0.299599508303682302, -0.0141518163448535055)
+COST_BY_RATES = (
+    0.621961585551280884,
+    0.0680014041508743366,
+    0.169176463995892817,
+    0.272560693950007505,
+)
 
 
 def _field(t: RealScalarLike, y: Float[Array, "2"], args: LotkaVolterraArgs) -> Float[Array, "2"]:
@@ -80,7 +89,8 @@ def lotka_volterra(
 
     A known trap: the gradients that the same source prints for `|1 - y(10)|^2 / 2` are
     good to 2-3 digits only, as its adjoint run starts at `t = 10.001` from the state at
-    `t = 10`.
+    `t = 10`. They are 0.2995995 and -0.0141518 for the initial state, 0.6219616, 0.0680014,
+    0.1691765 and 0.2725607 for the rates.
 
     Source: SUNDIALS, example `ark_lotka_volterra_ASA`.
     """
