@@ -11,9 +11,15 @@ import manifold_jax as mj
 
 from ._fuzz_checks import Fault, Judge
 from ._fuzz_families import Args
-from ._fuzz_lanes import FAILING, gradient_directions, Lanes, moved_lanes, take
+from ._fuzz_lanes import (
+    FAILING,
+    gradient_directions,
+    Lanes,
+    moved_lanes,
+    reference_paths,
+    take,
+)
 from ._fuzz_program import FRACTIONS, solve
-from ._fuzz_reference import NoReferenceError, on_manifold, solve as solve_reference
 from ._fuzz_structure import IMPLICIT, SPLIT, Structure
 
 
@@ -36,18 +42,18 @@ def check_gradients(
     directions = gradient_directions(structure, lanes)
     forward = jax.jit(jax.vmap(_forward(structure)))
     reverse = jax.jit(jax.vmap(_reverse(structure)))
-    value, slope = map(np.asarray, forward(lanes, directions))
+    slope = np.asarray(forward(lanes, directions))
     backward, okay = map(np.asarray, reverse(lanes, directions))
-    spoilt, _ = map(np.asarray, reverse(failing, directions))
     trusted = trusted & okay
     faults = []
     if not np.all(np.isfinite(slope[trusted])) or not np.all(np.isfinite(backward[trusted])):
         return [Fault("gradient", "not finite")], {}
-    others = np.delete(np.arange(len(slope)), FAILING)
-    others = others[trusted[others]]
-    if not np.array_equal(backward[others], spoilt[others]):
-        faults.append(Fault("lanes", "gradients of other lanes change with a failing lane"))
-    scale = _scale(structure, lanes, directions, judge)
+    if not _raises_upstream(structure):
+        spoilt = np.asarray(reverse(failing, directions)[0])
+        others = np.flatnonzero(trusted & (np.arange(len(slope)) != FAILING))
+        if not np.array_equal(backward[others], spoilt[others]):
+            faults.append(Fault("lanes", "gradients of other lanes change with a failing lane"))
+    scale = _scale(structure, lanes, directions)
     ways = np.max(np.abs(slope - backward)[trusted] / scale[trusted], initial=0.0)
     if ways > REVERSE_LIMIT:
         text = f"reverse and forward mode differ by {ways:.1e}"
@@ -64,6 +70,13 @@ def check_gradients(
     return faults, numbers
 
 
+def _raises_upstream(structure: Structure) -> bool:
+    """Whether the gradient of a plain Diffrax solve, too, raises for all lanes: NaN in a linear
+    solve of implicit stages or of the time of an event."""
+    solves = structure.solver in IMPLICIT + SPLIT or structure.output == "event"
+    return solves and structure.failing.startswith("nan")
+
+
 def _loss(structure: Structure, adjoint: Any, lane: Any) -> Any:
     """A weighted sum of all values handed out, and whether the solve succeeded."""
     out = solve(structure, adjoint)(lane)
@@ -77,12 +90,12 @@ def _with(lane: Any, parameters: Args) -> Any:
 
 
 def _forward(structure: Structure) -> Any:
-    """Value and slope along a direction."""
+    """The slope along a direction."""
 
     def slope(lane, direction):
         chosen = {name: lane["args"][name] for name in direction}
         loss = lambda parameters: _loss(structure, dfx.ForwardMode(), _with(lane, parameters))[0]
-        return jax.jvp(loss, (chosen,), (direction,))
+        return jax.jvp(loss, (chosen,), (direction,))[1]
 
     return slope
 
@@ -104,22 +117,14 @@ def _path_changes(
     structure: Structure, lanes: Lanes, directions: Args, s: np.ndarray, h: float
 ) -> np.ndarray:
     """Derivatives of the solutions along the directions, by differences of SciPy's."""
-    family, ends = structure.family, []
-    for sign in (1, -1):
-        moved = moved_lanes(structure, lanes, directions, sign * h)
-        y0 = moved["y0"]
-        if family.exact(moved["end"], y0, moved["args"]) is None and not family.mechanical:
-            y0 = on_manifold(family, moved["start"], y0, moved["args"])
-        ends.append(solve_reference(family, moved["args"], y0, structure.jumps).at(s))
+    moved = [moved_lanes(structure, lanes, directions, sign * h) for sign in (1, -1)]
+    ends = [reference_paths(structure, each)(s) for each in moved]
     return (ends[0] - ends[1]) / (2 * h)
 
 
-def _scale(structure: Structure, lanes: Lanes, directions: Args, judge: Judge) -> np.ndarray:
+def _scale(structure: Structure, lanes: Lanes, directions: Args) -> np.ndarray:
     """Sizes of the derivatives, so that cancellation in the weighted sum does not matter."""
-    try:
-        changes = _path_changes(structure, lanes, directions, FRACTIONS, 1e-4)
-    except NoReferenceError:
-        return np.ones(len(lanes["y0"]))
+    changes = _path_changes(structure, lanes, directions, FRACTIONS, 1e-4)
     return np.maximum(np.max(np.abs(changes), axis=(0, 2)), 1e-3)
 
 
@@ -135,7 +140,7 @@ def _expected(
             return None, None
         s = np.array([1.0]) if structure.output == "t1" else FRACTIONS
         changes = _path_changes(structure, lanes, directions, s, 1e-4)
-        return (changes @ weights).sum(axis=0), 1e4 * structure.tolerance * growth**2 + 1e-5 + (
+        return (changes @ weights).sum(axis=0), 300 * structure.tolerance * growth**2 + 1e-5 + (
             judge.between if structure.output != "t1" else 0
         )
     if structure.output == "event" or structure.approach == "partition":

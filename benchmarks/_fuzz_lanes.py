@@ -6,13 +6,15 @@ import numpy as np
 
 from ._fuzz_families import Args
 from ._fuzz_program import FRACTIONS, JUMP, level_function
-from ._fuzz_reference import Paths, solve
+from ._fuzz_reference import on_manifold, Paths, solve
 from ._fuzz_structure import Structure
 
 
 FAILING = 2
 # Fewer draws of large systems.
 LARGE, MOST_LARGE = 50, 12
+# How far starts are off the manifold, where they are.
+OFFSET = 1e-2
 # Where events are put, as a fraction of the run.
 EVENT = 0.6
 
@@ -39,14 +41,24 @@ def draw(structure: Structure, draws: int) -> Lanes:
         "spoilt": np.zeros(draws),
         "level": np.zeros(draws),
     }
+    if structure.offset:
+        y0 = y0 + OFFSET * rng.uniform(-1.0, 1.0, y0.shape)
     return {"start": start, "end": end, "y0": y0, "args": args | common}
+
+
+def consistent(structure: Structure, lanes: Lanes) -> np.ndarray:
+    """The starts, moved onto the manifold."""
+    family = structure.family
+    if family.mechanical or family.conserves or family.stiff:
+        return lanes["y0"]  # they are there
+    return on_manifold(family, lanes["start"], lanes["y0"], lanes["args"])
 
 
 def with_events(structure: Structure, lanes: Lanes, paths: Paths) -> Lanes:
     """With levels that the event function reaches inside the run."""
     if structure.output != "event":
         return lanes
-    level = level_function(np, paths.at(np.array([EVENT]))[0])
+    level = level_function(np, paths(np.array([EVENT]))[0])
     return lanes | {"args": lanes["args"] | {"level": level}}
 
 
@@ -71,7 +83,7 @@ def with_failing_lane(structure: Structure, lanes: Lanes) -> Lanes:
 
 
 def reference_paths(structure: Structure, lanes: Lanes) -> Paths:
-    return solve(structure.family, lanes["args"], lanes["y0"], structure.jumps)
+    return solve(structure.family, lanes["args"], consistent(structure, lanes), structure.jumps)
 
 
 def amplification(structure: Structure, lanes: Lanes, paths: Paths) -> np.ndarray:
@@ -83,9 +95,10 @@ def amplification(structure: Structure, lanes: Lanes, paths: Paths) -> np.ndarra
     family = structure.family
     if family.exact(lanes["end"], lanes["y0"], lanes["args"]) is not None:
         return np.ones(len(change))
-    moved = solve(family, lanes["args"], lanes["y0"] + change, structure.jumps)
-    growth = np.linalg.norm(moved.at(FRACTIONS) - paths.at(FRACTIONS), axis=-1) / size
-    return np.maximum(1.0, growth.max(axis=0))
+    y0 = consistent(structure, lanes) + change
+    moved = solve(family, lanes["args"], y0, structure.jumps)
+    growth = np.linalg.norm(moved(FRACTIONS) - paths(FRACTIONS), axis=-1) / size
+    return np.maximum(1.0, growth.max(axis=0))  # NaN where there is no reference
 
 
 def gradient_directions(structure: Structure, lanes: Lanes) -> Args:

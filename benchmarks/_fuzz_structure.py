@@ -32,6 +32,7 @@ class Structure:
 
     - `tolerance`: of adaptive steps and implicit stages; `steps` the number of given ones.
     - `failing`: what is wrong with one lane of the batch.
+    - `offset`: starts are not on the manifold.
     - `own_field`: the field is made tangent by the library, not by the fuzz program.
     - `single`: one lane is solved alone, too; `reverse` names an adjoint to be compared with
         forward mode, or is `None`.
@@ -52,6 +53,7 @@ class Structure:
     approach: str
     failing: str
     own_field: bool
+    offset: bool
     single: bool
     reverse: str | None
 
@@ -84,6 +86,7 @@ class Structure:
             self.approach,
             f"lane: {self.failing}",
         ]
+        words += ["starts off"] if self.offset else []
         words += ["single"] if self.single else []
         words += [f"gradient: {self.reverse}"] if self.reverse else []
         return " | ".join(words)
@@ -122,6 +125,7 @@ def structure(index: int, seed: int) -> Structure:
         direction="forward" if family.stiff else choose(DIRECTIONS),
         approach=approach,
         failing=_failing(family, approach, controller in ADAPTIVE, choose),
+        offset=_may_start_off(family, approach) and chance(0.3),
         own_field=isinstance(family, Quadrics) and family.m < family.n and chance(0.3),
         single=chance(0.4),
         reverse=reverse,
@@ -181,6 +185,12 @@ def _method(family: Family, approach: str, choose: Any, chance: Any) -> tuple[st
     if controller in GIVEN_STEPS and chance(0.1):
         return "Euler", controller
     return choose(EXPLICIT if chance(0.5) else EXPLICIT[:3]), controller
+
+
+def _may_start_off(family: Family, approach: str) -> bool:
+    """Whether NumPy knows to which point of the manifold the library will go."""
+    simple = not (family.mechanical or family.conserves or family.stiff)
+    return simple and approach not in ("error-metric", "weights", "steps-only")
 
 
 def _failing(family: Family, approach: str, adaptive: bool, choose: Any) -> str:

@@ -44,9 +44,7 @@ def run(indices: list[int], seed: int, draws: int, limit: float) -> Iterator[Rec
             yield record
 
 
-def _in_one_process(
-    indices: list[int], seed: int, draws: int, limit: float
-) -> Iterator[Record]:
+def _in_one_process(indices: list[int], seed: int, draws: int, limit: float) -> Iterator[Record]:
     command = [sys.executable, "-m", "benchmarks._fuzz_worker", str(seed), str(draws)]
     with tempfile.TemporaryFile("w+") as errors:
         process = subprocess.Popen(
@@ -165,7 +163,9 @@ def main(
     cases = sum(record.get("cases", 0) for record in records)
     faulty = sum(bool(record["faults"]) for record in records)
     minutes = (time.perf_counter() - started) / 60
-    console.print(f"{faulty} of {len(records)} structures with faults; {cases} cases, {minutes:.0f} min")
+    console.print(
+        f"{faulty} of {len(records)} structures with faults; {cases} cases, {minutes:.0f} min"
+    )
     raise typer.Exit(1 if faulty else 0)
 
 
