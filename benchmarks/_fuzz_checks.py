@@ -21,7 +21,7 @@ REGULAR, MOST_AMPLIFIED = 0.05, 1e3
 # Times at which that is asked.
 LOOKS = 21
 # Errors that are plausible: in tolerances, or in errors of a Runge-Kutta method in NumPy.
-IN_TOLERANCES, IN_YARDSTICKS = 50.0, 20.0
+IN_TOLERANCES, IN_YARDSTICKS = 10.0, 20.0
 # Points of a lane that are compared, points of all lanes of which violations are computed.
 PER_LANE, MOST_POINTS = 6, 4000
 
@@ -205,25 +205,30 @@ def check_events(structure: Structure, lanes: Lanes, judge: Judge, found: Any) -
     if structure.output != "event":
         return []
     s = np.linspace(0.0, 1.0, 801)
-    level = lanes["args"]["level"]
-    signs = np.sign(level_function(np, judge.paths(s)) - level)
-    crossings = np.cumsum(signs[1:] != signs[:-1], axis=0)
-    length = lanes["end"] - lanes["start"]
+    level, length = lanes["args"]["level"], lanes["end"] - lanes["start"]
+    off = 10 * (judge.bound + judge.between) * (1 + np.abs(level))
+    crossings = _crossings(level_function(np, judge.paths(s)) - level, off)
     happened = found["code"] == CODES.index("event_occurred")
     for i in np.flatnonzero(judge.trusted & _is_okay(found["code"])):
         fraction = (found["times"][i, -1] - lanes["start"][i]) / length[i]
-        row = int(np.clip(fraction * 800, 0, 799))
-        before = crossings[row, i]
+        before = crossings[int(np.clip(fraction * 800, 0, 799)), i]
         expected = level_function(np, judge.paths(np.array([fraction]))[0, i]) - level[i]
         value = level_function(np, found["states"][i, -1]) - level[i]
         if happened[i] and abs(value) > 1e-6:
             return [Fault("event", f"the function is {value:.1e} at the event of lane {i}")]
-        off = 10 * (judge.bound[i] + judge.between) * (1 + abs(level[i]))
-        if happened[i] and before % 2 == 1 and abs(expected) > off:
+        if happened[i] and before % 2 == 1 and abs(expected) > off[i]:
             return [Fault("event", f"lane {i} went on beyond a crossing")]
-        if not happened[i] and crossings[-1, i] % 2 == 1 and structure.is_adaptive:
+        if not happened[i] and crossings[-1, i] % 2 == 1:
             return [Fault("event", f"lane {i} met no event")]
     return []
+
+
+def _crossings(values: np.ndarray, off: np.ndarray) -> np.ndarray:
+    """How often the sign has changed so far, values closer to zero than `off` left out."""
+    signs = np.where(np.abs(values) > off, np.sign(values), 0)
+    for k in range(1, len(signs)):
+        signs[k] = np.where(signs[k] == 0, signs[k - 1], signs[k])
+    return np.cumsum(signs[1:] * signs[:-1] < 0, axis=0)
 
 
 def check_single(

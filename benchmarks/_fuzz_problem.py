@@ -6,6 +6,7 @@ from typing import Any
 import diffrax as dfx
 import jax.numpy as jnp
 import jax.tree_util as jtu
+import optimistix as optx
 
 import manifold_jax as mj
 
@@ -79,7 +80,8 @@ class Problem:
         if name == "HalfSolver":
             return dfx.HalfSolver(dfx.Heun())
         if name in IMPLICIT + SPLIT and not self.structure.is_adaptive:
-            root_finder = dfx.VeryChord(rtol=1e-10, atol=1e-10)
+            # Diffrax's `VeryChord` gives up at such tolerances, with plain solvers, too.
+            root_finder = optx.Newton(rtol=1e-10, atol=1e-10)
             return getattr(dfx, name)(root_finder=root_finder, root_find_max_steps=30)
         return getattr(dfx, name)()
 
