@@ -60,8 +60,8 @@ def judge(structure: Structure, lanes: Lanes, paths: Paths, growth: np.ndarray) 
     regular = np.min(conditions, axis=0) > REGULAR
     step = 1 / structure.steps
     if structure.is_adaptive:
-        bound = IN_TOLERANCES * structure.tolerance * growth
-        between = IN_TOLERANCES * structure.tolerance
+        between = IN_TOLERANCES * structure.tolerance * (10 if structure.family.stiff else 1)
+        bound = between * growth
     else:
         bound = IN_YARDSTICKS * _yardstick(structure, lanes, paths) + 1e-10 * growth
         between = step**2 if structure.solver in LOW_ORDER else 10 * step**4

@@ -106,7 +106,9 @@ def structure(index: int, seed: int) -> Structure:
     if family.stiff:
         tolerances = (1e-6, 1e-8)
     # Diffrax's own function corrects steps, not what is between them.
-    output = choose(("t1", "steps") if approach == "steps-only" else OUTPUTS)
+    # In a stiff network levels are flat where events would be.
+    outputs = OUTPUTS[:-1] if family.stiff else OUTPUTS
+    output = choose(("t1", "steps") if approach == "steps-only" else outputs)
     reverse = choose(REVERSE[:2] if chance(0.9) else REVERSE) if chance(0.35) else None
     if output in ("dense", "event") and reverse == "replay":
         reverse = "default"
