@@ -126,7 +126,7 @@ def structure(index: int, seed: int) -> Structure:
         output=output,
         direction="forward" if family.stiff else choose(DIRECTIONS),
         approach=approach,
-        failing=_failing(family, approach, controller in ADAPTIVE, choose),
+        failing=_failing(family, approach, controller in ADAPTIVE and not implicit, choose),
         offset=_may_start_off(family, approach) and chance(0.3),
         own_field=isinstance(family, Quadrics) and family.m < family.n and chance(0.3),
         single=chance(0.4),
@@ -195,8 +195,8 @@ def _may_start_off(family: Family, approach: str) -> bool:
     return simple and approach not in ("error-metric", "weights", "steps-only")
 
 
-def _failing(family: Family, approach: str, adaptive: bool, choose: Any) -> str:
-    options = [kind for kind in FAILURES if kind != "fast" or adaptive]
+def _failing(family: Family, approach: str, may_be_fast: bool, choose: Any) -> str:
+    options = [kind for kind in FAILURES if kind != "fast" or may_be_fast]
     if approach in (*STABILIZED, *OF_MECHANICS, "exact-0") or family.conserves:
         # What is stabilized may end off the manifold; frozen invariants can always be satisfied.
         options = [kind for kind in options if kind not in ("impossible", "dependent")]
