@@ -75,7 +75,12 @@ def _yardstick(structure: Structure, lanes: Lanes, paths: Paths) -> np.ndarray:
     """Errors of the same method, or of a simple one of low order, for each lane."""
     grid = np.linspace(0.0, 1.0, structure.steps + 1)
     name = structure.solver
-    simple = {"HalfSolver": "Heun", "Euler": "Midpoint", "ImplicitEuler": "Midpoint"}
+    simple = {
+        "HalfSolver": "Heun",
+        "Sil3": "Heun",
+        "Euler": "Midpoint",
+        "ImplicitEuler": "Midpoint",
+    }
     name = simple.get(name, "Bosh3" if name in IMPLICIT + SPLIT else name)
     tableau = getattr(dfx, name)().tableau
     expected = paths(grid)
@@ -94,7 +99,10 @@ def check_results(structure: Structure, judge: Judge, found: Any, failed: Any) -
     """Result codes, and NaN where there is success."""
     faults = []
     okay = _is_okay(found["code"])
-    refused = np.flatnonzero(judge.trusted & ~okay)
+    # Newton's method does not always find the time of an event, with plain solvers, too.
+    unfound = found["code"] == CODES.index("nonlinear_max_steps_reached")
+    unfound &= structure.output == "event"
+    refused = np.flatnonzero(judge.trusted & ~okay & ~unfound)
     if refused.size > 0:
         codes = sorted({CODES[c] if c >= 0 else "other" for c in found["code"][refused]})
         text = (

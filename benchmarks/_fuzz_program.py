@@ -100,8 +100,8 @@ def _output(structure: Structure, lane: Any) -> tuple[dfx.SaveAt, Any, Callable]
     inside = times[1:-1]
     if structure.output == "event":
         level = lambda t, y, args, **kwargs: level_function(jnp, unpack(y)) - args["level"]
-        # Newton's method does not always find the time, in plain Diffrax, too.
-        event = dfx.Event(level, optx.Bisection(rtol=1e-10, atol=1e-10))
+        # A bisection raises for all lanes if one of them has no event, in plain Diffrax, too.
+        event = dfx.Event(level, optx.Newton(rtol=1e-10, atol=1e-10))
         return dfx.SaveAt(t1=True), event, plain
     if structure.output == "dense":
         evaluated = lambda sol: (times, rows(jax.vmap(sol.evaluate)(times)))
