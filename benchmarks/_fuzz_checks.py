@@ -61,7 +61,9 @@ def judge(structure: Structure, lanes: Lanes, paths: Paths, growth: np.ndarray) 
     step = 1 / structure.steps
     if structure.is_adaptive:
         # Methods of low order take many steps; stiff solvers lose some of their order.
-        more = {"ImplicitEuler": 20}.get(structure.solver, 1 + 2 * (structure.solver in LOW_ORDER))
+        more = {"ImplicitEuler": 20}.get(
+            structure.solver, 1 + 2 * (structure.solver in (*LOW_ORDER, "Bosh3"))
+        )
         more = 10 if structure.family.stiff else more
         between = IN_TOLERANCES * structure.tolerance * more
         bound = between * growth
