@@ -136,9 +136,9 @@ def row_scale(G: Float[Array, "m n"], x: Float[Array, " n"]) -> Float[Array, " m
     This is row equilibration (Sudarsan & Keerthi 1998, eqs. (3.3)-(3.4), with the typical
     sizes taken from the state).
 
-    The 1 is a length that the state may not show. With the size of the state in its place a rod
-    of length 1 whose displacements are 1e-3 could not be corrected, as its residual has rounding
-    errors of 1e-16, and none that passes through zero.
+    The 1 stands for lengths that the state does not show. With the size of the state in its place
+    a third of the points beside a rod of length 1, given as displacements of 1e-3, could not be
+    corrected: the residual has rounding errors of 1e-16 whatever the displacements.
     """
     scale = jnp.max(jnp.abs(G) * (jnp.abs(x) + 1)[None, :], axis=1)
     return jnp.maximum(scale, jnp.finfo(G.dtype).tiny)

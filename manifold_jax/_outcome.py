@@ -77,10 +77,11 @@ def _undo_steps(
     times the tolerance per length travelled. If a part of the field is normal, they are that part
     of the length whatever the tolerance.
     """
-    share = 1e-2
-    if projection.rtol is not None and projection.atol is not None:
-        share = jnp.minimum(share, 1e3 * (projection.rtol + projection.atol))
     dtype = statistics.correction.dtype
+    share = jnp.asarray(1e-2, dtype)
+    if projection.rtol is not None and projection.atol is not None:
+        tolerance = jnp.asarray(projection.rtol, dtype) + jnp.asarray(projection.atol, dtype)
+        share = jnp.minimum(share, 1e3 * tolerance)
     rounding = 1e3 * jnp.finfo(dtype).eps * jnp.asarray(num_accepted_steps, dtype)
     return statistics.correction > share * statistics.displacement + rounding
 

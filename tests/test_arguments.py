@@ -82,6 +82,12 @@ def test_swapped_arguments():
             function(START, 0.0, CIRCLE)
 
 
+def test_several_times_at_once():
+    sol = solve(saveat=dfx.SaveAt(dense=True), max_steps=16)
+    with pytest.raises(ValueError, match=r"`t0` must be one time.*jax.vmap\(sol.evaluate\)\(ts\)"):
+        sol.evaluate(jnp.linspace(0.0, 1.0, 3))
+
+
 two = lambda t, y: y
 three = lambda t, q, args: q[0]
 four = lambda t, q, v, args: q

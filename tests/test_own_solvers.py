@@ -91,7 +91,7 @@ def with_tableau(c, a_lower, b_sol, b_error):
 
 def many_equations(t, y, args):
     """As long as a field whose stages are run in a loop."""
-    for _ in range(200):
+    for _ in range(400):
         y = 2.0 * (0.5 * y)
     return jnp.stack([-y[1], y[0]])
 
@@ -112,3 +112,24 @@ def test_tableaux(solver, field):
     plain = dfx.diffeqsolve(terms, solver, *rest)
     projected = mj.diffeqsolve(terms, mj.Projected(solver, CIRCLE), *rest)
     np.testing.assert_allclose(projected.ys[0], to_circle(plain.ys[0]), atol=1e-15)
+
+
+class OneStage(dfx.ButcherTableau):
+    """Diffrax asks for the last row of `a_lower`, which has none."""
+
+    def __post_init__(self):
+        for name, value in dict(ssal=False, fsal=False, implicit=False, num_stages=1).items():
+            object.__setattr__(self, name, value)
+
+
+class OwnEuler(dfx.AbstractERK):
+    tableau = OneStage(c=np.zeros(0), a_lower=(), b_sol=np.ones(1), b_error=np.zeros(1))
+    interpolation_cls = dfx.ThirdOrderHermitePolynomialInterpolation.from_k
+
+    def order(self, terms):
+        return 1
+
+
+def test_one_stage():
+    y = START + 0.1 * 2.0 * np.array([-START[1], START[0]])
+    np.testing.assert_allclose(one_step(OwnEuler()).ys[0], to_circle(y), atol=1e-15)
