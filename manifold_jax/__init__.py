@@ -16,7 +16,6 @@ from ._chart import (
 )
 from ._constraint import (
     Constraint as Constraint,
-    constraint_violation as constraint_violation,
     Invariants as Invariants,
 )
 from ._diffeqsolve import diffeqsolve as diffeqsolve
@@ -30,8 +29,8 @@ from ._mechanics import (
 from ._projection import (
     NewtonProjection as NewtonProjection,
     project as project,
-    ProjectionInfo as ProjectionInfo,
 )
+from ._projection_info import ProjectionInfo as ProjectionInfo
 from ._solver import (
     LocalCoordinates as LocalCoordinates,
     Projected as Projected,
@@ -42,6 +41,7 @@ from ._stabilization import (
     InvariantStabilization as InvariantStabilization,
 )
 from ._tangent import tangent_field as tangent_field
+from ._violation import constraint_violation as constraint_violation
 
 
 __version__ = version("manifold_jax")

@@ -56,6 +56,16 @@ def nonlinear_failure() -> RESULTS:
     return RESULTS.nonlinear_divergence
 
 
+def number_of_result(result: RESULTS) -> Any:
+    """The number by which a result code is stored."""
+    return result._value  # pyright: ignore
+
+
+def messages_of_results() -> list[str]:
+    """The messages of all result codes, by number."""
+    return list(RESULTS._index_to_message)  # pyright: ignore
+
+
 def save_states(state: Any) -> list[SaveState]:
     """What a solve has saved so far, one per `SubSaveAt`."""
     is_save_state = lambda x: isinstance(x, SaveState)

@@ -10,25 +10,22 @@ import jax.tree_util as jtu
 from diffrax import RESULTS
 
 from ._adjoint import LocatingAdjoint, StepReplayAdjoint
-from ._compat import is_okay, nonlinear_failure, update_result
+from ._arguments import check_arguments, raise_if_unstable
+from ._compat import is_okay, nonlinear_failure, save_y, update_result
 from ._constraint import check_constraint, check_state
 from ._custom_types import Args, RealScalarLike, Y
-from ._initial import (
-    controller_tolerances,
-    initial_step,
-    raise_if_bad_start,
-    start_state,
-    StartInfo,
-)
+from ._diagnosis import raise_unless
+from ._errors import clear_errors
+from ._initial import controller_tolerances, initial_step, start_state, StartInfo
 from ._interpolation import ManifoldInterpolation
 from ._mechanics.term import DirectedTerm
+from ._outcome import fault_messages, raise_if_failed, result_of_saved
 from ._output import events_in_true_time, on_manifold_saving, project_output
-from ._solver import Stabilized
 from ._solver.base import AbstractManifoldSolver
 from ._solver.implicit import with_accurate_stages
-from ._stabilization import is_stable, stability_interval
 
 
+@clear_errors
 @eqx.filter_jit
 def diffeqsolve(
     terms: Any,
@@ -83,16 +80,21 @@ def diffeqsolve(
 
     - `initial_correction`: how far `y0` was moved, the largest `|change| / (|y0| + 1)`;
     - `num_projection_iterations`: Newton iterations over all accepted steps;
-    - `largest_correction`: the largest such correction of an accepted step.
+    - `largest_correction`: the largest such correction of an accepted step;
+    - `correction_share`: with [`Projected`][] the part of the steps that the corrections undid,
+        their sum over that of the displacements. Where the field is tangent it is as small as the
+        tolerance; if it is not, see [`tangent_field`][].
 
     **Raises:**
 
     `TypeError` or `ValueError` for arguments that cannot work. With `throw=True` a
     `RuntimeError` where the solve fails; with `throw=False` look at `sol.result`:
-    `RESULTS.nonlinear_divergence` is a constraint that could not be satisfied.
+    `RESULTS.nonlinear_divergence` is a constraint that could not be satisfied, and
+    `RESULTS.nonfinite` a state that is NaN or infinite, also with a solver of Diffrax alone.
 
     Source: Sudarsan & Keerthi, Appl. Math. Comput. 92 (1998) 153-193.
     """
+    check_arguments(terms, solver, dt0, saveat, stepsize_controller, adjoint, event)
     _check_arguments(adjoint, consistent)
     if event is not None and event.root_finder is not None:
         adjoint = LocatingAdjoint(adjoint)
@@ -105,13 +107,18 @@ def diffeqsolve(
         controller_state=controller_state,
         made_jump=made_jump,
     )
-    if throw and isinstance(stepsize_controller, dfx.ConstantStepSize) and dt0 is not None:
-        y0 = _raise_if_unstable(y0, terms, solver, dt0)
+    is_fixed = throw and isinstance(stepsize_controller, dfx.ConstantStepSize) and dt0 is not None
     if not isinstance(solver, AbstractManifoldSolver):
-        solver, options = with_accurate_stages(solver), options | dict(event=event, throw=throw)
-        return dfx.diffeqsolve(terms, solver, t0, t1, dt0, y0, args, saveat=saveat, **options)
+        if is_fixed:
+            y0 = raise_if_unstable(y0, terms, solver, dt0)
+        solver = with_accurate_stages(solver)
+        return _solve_without_hook(
+            terms, solver, t0, t1, dt0, y0, args, saveat, throw, event=event, **options
+        )
     time_dtype = _time_dtype(t0, t1, dt0, saveat)
     y0 = _as_state(y0, time_dtype)
+    if is_fixed:
+        y0 = raise_if_unstable(y0, terms, solver, dt0)
     t0, t1 = jnp.asarray(t0, time_dtype), jnp.asarray(t1, time_dtype)
     check_constraint(solver.constraint, t0, y0, args)
     solver = _with_tolerances(solver, stepsize_controller)
@@ -119,7 +126,7 @@ def diffeqsolve(
         solver = eqx.tree_at(lambda s: s.bend_interpolant, solver, False)
     y0, start = start_state(solver.constraint, t0, y0, args, solver.projection, consistent)
     if throw:
-        y0 = raise_if_bad_start(y0, start)
+        y0 = raise_unless(start.success, start.cause, y0, "y0")
     if dt0 is None:
         dt0 = _first_step(terms, solver, t0, t1, y0, args, stepsize_controller)
 
@@ -136,39 +143,61 @@ def diffeqsolve(
         throw=False,
         **options,
     )
+    statistics = sol.solver_state.statistics
     sol = _finish(sol, solver, saveat, event, y0, args, start)
     if not throw:
         return sol
+    faults = fault_messages(sol.result, solver, statistics, sol.stats["num_accepted_steps"])
     # A bad start has raised its own, clearer error.
-    return sol.result.error_if(sol, ~is_okay(sol.result) & start.success)
+    return raise_if_failed(sol, ~is_okay(sol.result) & start.success, faults)
+
+
+def _solve_without_hook(
+    terms: Any,
+    solver: dfx.AbstractSolver,
+    t0: RealScalarLike,
+    t1: RealScalarLike,
+    dt0: RealScalarLike | None,
+    y0: Y,
+    args: Args,
+    saveat: dfx.SaveAt,
+    throw: bool,
+    **options: Any,
+) -> dfx.Solution:
+    """What Diffrax returns, except that a state that is not finite is no success."""
+    subs = jtu.tree_leaves(saveat.subs, is_leaf=lambda x: isinstance(x, dfx.SubSaveAt))
+    unseen = not any(sub.fn is save_y for sub in subs)
+    watched = saveat
+    if unseen:
+        both = saveat.subs, dfx.SubSaveAt(t1=True)
+        watched = eqx.tree_at(lambda s: s.subs, saveat, both, is_leaf=lambda x: x is None)
+    sol = dfx.diffeqsolve(
+        terms, solver, t0, t1, dt0, y0, args, saveat=watched, throw=throw, **options
+    )
+    result = update_result(sol.result, result_of_saved(watched, sol.ts, sol.ys))
+    ts, ys = (sol.ts[0], sol.ys[0]) if unseen else (sol.ts, sol.ys)
+    sol = eqx.tree_at(
+        lambda s: (s.ts, s.ys, s.result), sol, (ts, ys, result), is_leaf=lambda x: x is None
+    )
+    return raise_if_failed(sol, ~is_okay(result), []) if throw else sol
 
 
 def _check_arguments(adjoint: Any, consistent: str) -> None:
+    if isinstance(adjoint, dfx.ImplicitAdjoint):
+        raise ValueError(
+            "`adjoint=ImplicitAdjoint()` inverts df/dy, which is singular on a manifold: it says nothing of the "
+            "directions across. Leave `adjoint` out (`mj.StepReplayAdjoint()`), or for the minimum of a function "
+            "`mj.gradient_flow`."
+        )
     if isinstance(adjoint, dfx.BacksolveAdjoint):
         raise ValueError(
             "`adjoint=BacksolveAdjoint()` loses the gradient through the corrections (it would be silently wrong). "
-            "Use `RecursiveCheckpointAdjoint()` (the default), `ForwardMode()` or `DirectAdjoint()`."
+            "Leave `adjoint` out (`mj.StepReplayAdjoint()`), or use `diffrax.ForwardMode()`."
         )
     if consistent not in ("project", "check", "assume"):
         raise ValueError(
             f"`consistent` must be 'project', 'check' or 'assume', got {consistent!r}."
         )
-
-
-def _raise_if_unstable(y0: Y, terms: Any, solver: dfx.AbstractSolver, dt0: RealScalarLike) -> Y:
-    """Refuse constant steps with which stabilization makes violations grow."""
-    stabilized = isinstance(solver, Stabilized)
-    if not stabilized and not isinstance(terms, DirectedTerm):
-        return y0
-    gain = solver.stabilization.gain if stabilized else terms.rate
-    inner = solver.solver if isinstance(solver, dfx.AbstractWrappedSolver) else solver
-    interval = stability_interval(inner)
-    message = (
-        f"`stabilization` has a gain with which gain * dt0 is beyond the stability interval {interval:.2f} of "
-        f"{type(inner).__name__}: violations would grow. Use a smaller gain or `dt0`, or an adaptive step size "
-        "controller."
-    )
-    return eqx.error_if(y0, ~is_stable(gain, dt0, inner), message)
 
 
 def _time_dtype(t0: Any, t1: Any, dt0: Any, saveat: dfx.SaveAt) -> Any:
@@ -218,12 +247,16 @@ def _finish(
     """Correct what was saved, and report."""
     ys, failed = project_output(saveat, event, solver, sol.ts, sol.ys, y0, args)
     failed_output = RESULTS.where(failed, nonlinear_failure(), RESULTS.successful)
-    result = update_result(sol.result, failed_output)
+    # Diffrax forgets that a step failed if it has an event, too.
+    result = update_result(sol.result, sol.solver_state.result)
+    result = update_result(result, failed_output)
+    if not solver.corrects_output:
+        result = update_result(result, result_of_saved(saveat, sol.ts, ys))
     result = RESULTS.where(start.success, result, nonlinear_failure())
     interpolation = sol.interpolation
     if interpolation is not None and solver.corrects_output:
-        interpolation = ManifoldInterpolation(
-            interpolation, solver.constraint, solver.projection, args
+        interpolation = ManifoldInterpolation.build(
+            interpolation, solver.constraint, solver.projection, sol.t0, y0, args
         )
     statistics = sol.solver_state.statistics
     stats = {
@@ -231,6 +264,7 @@ def _finish(
         "initial_correction": start.correction,
         "num_projection_iterations": statistics.iterations,
         "largest_correction": statistics.largest_correction,
+        "correction_share": statistics.correction_share,
     }
     return dfx.Solution(
         t0=sol.t0,

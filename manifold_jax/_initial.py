@@ -9,28 +9,16 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 
-from ._constraint import AbstractConstraint, check_constraint, check_state, constraint_violation
+from ._constraint import AbstractConstraint
 from ._custom_types import Args, BoolScalar, FloatScalar, IntScalar, RealScalarLike, Y
-from ._mechanics import MechanicalConstraint
-from ._projection import NewtonProjection, ProjectionInfo
+from ._diagnosis import failure_cause, NOT_THERE
+from ._errors import clear_errors
+from ._projection import moved, NewtonProjection
+from ._projection_info import ProjectionInfo
+from ._violation import constraint_violation
 
 
-_MESSAGES = (
-    "`constraint` is not finite at the initial time and `y0`. Start from a state at which g(t0, y0, args) "
-    "is defined.",
-    "The Jacobian dg/dy of `constraint` does not have full rank at `y0`: an equation ignores y, depends on the "
-    "others (redundant), or `y0` is a singular point. Remove dependent equations (or, for an "
-    "`mj.MechanicalSystem`, pass `redundant=True`), or start elsewhere.",
-    "`y0` could not be made consistent with `constraint`: no nearby state satisfies g(t0, y, args) = 0. Start "
-    "closer to the manifold, or check that the equations can hold at the same time.",
-    '`y0` is not on the manifold. Write `consistent="project"` to have it moved there, or correct it first with '
-    "`mj.consistent_state`.",
-    "`mass_matrix` is not symmetric at `y0`. Return `(M + M.T) / 2`, or check its formula.",
-    "`mass_matrix` is not positive definite at `y0` (a matrix may be singular, but not for motions that the "
-    "constraints allow; a scalar or a diagonal must be positive). Check its signs and that no mass is missing.",
-)
-
-
+@clear_errors
 @eqx.filter_jit
 def consistent_state(
     constraint: AbstractConstraint,
@@ -61,24 +49,14 @@ def consistent_state(
     A `RuntimeError` (under `jit` too) that says whether the constraint was not finite, its
     Jacobian rank deficient, or the equations could not be satisfied.
     """
-    check_state(y, "y0")
-    y = jtu.tree_map(jnp.asarray, y)
-    check_constraint(constraint, t, y, args)
     projection = NewtonProjection() if projection is None else projection
     patient = dataclasses.replace(projection, max_steps=max(50, projection.max_steps))
-    consistent, info = patient(constraint, t, y, args, far=True)
-    if throw:
-        cause = _failure_cause(info, constraint, t, y, args)
-        start = StartInfo(info.correction, info.success, cause)
-        consistent = raise_if_bad_start(consistent, start)
-    return consistent, info
+    return moved(patient, constraint, t, y, args, "y0", throw)
 
 
 class StartInfo(eqx.Module):
-    """How an initial value was treated.
-
-    The change made, whether the value can be used, and if not, which of `_MESSAGES` applies.
-    """
+    """How an initial value was treated: the change made, whether the value can be used, and if not,
+    the cause, a number of `_diagnosis.py`."""
 
     correction: FloatScalar
     success: BoolScalar
@@ -97,30 +75,15 @@ def start_state(
     if consistent == "assume":
         dtype = jnp.result_type(*jtu.tree_leaves(y0))
         return y0, StartInfo(jnp.zeros((), dtype), jnp.asarray(True), jnp.asarray(0))
-    moved, info = consistent_state(constraint, t0, y0, args, projection=projection, throw=False)
-    cause = _failure_cause(info, constraint, t0, y0, args)
+    start, info = consistent_state(constraint, t0, y0, args, projection=projection, throw=False)
+    cause = failure_cause(constraint, t0, y0, args, info.residual, info.full_rank)
     if consistent == "project":
-        return moved, StartInfo(info.correction, info.success, cause)
+        return start, StartInfo(info.correction, info.success, cause)
     violation = constraint_violation(constraint, t0, y0, args)
     tolerance = projection.tolerance_for(violation.dtype)
     satisfied = violation <= tolerance
-    cause = jnp.where(info.success, 3, cause)
+    cause = jnp.where(info.success, NOT_THERE, cause)
     return y0, StartInfo(jnp.zeros_like(info.correction), satisfied & info.full_rank, cause)
-
-
-def raise_if_bad_start(value: Any, start: StartInfo) -> Any:
-    """Attach the error that names the cause of a failed start to `value`."""
-    return eqx.branched_error_if(value, ~start.success, start.cause, list(_MESSAGES))
-
-
-def _failure_cause(
-    info: ProjectionInfo, constraint: AbstractConstraint, t: RealScalarLike, y: Y, args: Args
-) -> IntScalar:
-    cause = jnp.where(jnp.isfinite(info.residual), jnp.where(info.full_rank, 2, 1), 0)
-    if not isinstance(constraint, MechanicalConstraint):
-        return cause
-    symmetric, positive = constraint.check_mass(t, y, args)
-    return jnp.where(symmetric, jnp.where(positive, cause, 5), 4)
 
 
 def initial_step(
@@ -156,6 +119,7 @@ def initial_step(
     d0, d1 = norm(y0), norm(f0)
     small = (d0 < 1e-5) | (d1 < 1e-5)
     span = jnp.abs(t1 - t0)
+    span = jnp.where(jnp.isfinite(span), span, 1.0)  # solved until an event
     h0 = jnp.where(small, 1e-6 * span, 0.01 * d0 / jnp.where(small, 1.0, d1))
     step = direction * h0
     y1 = jtu.tree_map(lambda y, f: y + (step * f).astype(y.dtype), y0, f0)

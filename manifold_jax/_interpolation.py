@@ -1,12 +1,15 @@
 """Dense output: interpolants that end where the corrected steps do, and stay on the manifold."""
 
 from collections.abc import Callable
+from typing import Any
 
 import diffrax as dfx
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
+import numpy as np
+from jaxtyping import Array
 
 from ._constraint import AbstractConstraint
 from ._custom_types import Args, RealScalarLike, Y
@@ -67,12 +70,35 @@ class ManifoldInterpolation(dfx.AbstractPath):
 
     Evaluates the piecewise interpolant of the steps and corrects the value. A value that
     cannot be corrected is NaN.
+
+    Only arrays are leaves, as a solution may be returned from `jax.jit`: what the constraint
+    closes over is among them, its functions are not.
     """
 
     inner: dfx.AbstractPath
-    constraint: AbstractConstraint
-    projection: NewtonProjection
-    args: Args
+    arrays: Any
+    functions: tuple[tuple[Any, ...], Any] = eqx.field(static=True)
+
+    @staticmethod
+    def build(
+        inner: dfx.AbstractPath,
+        constraint: AbstractConstraint,
+        projection: NewtonProjection,
+        t: Array,
+        y: Y,
+        args: Args,
+    ) -> "ManifoldInterpolation":
+        """`t` and `y` are any time and state."""
+
+        def correct(t: Array, y: Y) -> Y:
+            corrected, info = projection(constraint, t, y, args)
+            return jtu.tree_map(lambda leaf: jnp.where(info.success, leaf, jnp.nan), corrected)
+
+        correct = eqx.filter_closure_convert(correct, t, y)
+        is_array = lambda x: isinstance(x, jax.Array | np.ndarray)
+        arrays, functions = eqx.partition(correct, is_array)
+        leaves, tree = jtu.tree_flatten(functions)
+        return ManifoldInterpolation(inner, arrays, (tuple(leaves), tree))
 
     @property
     def t0(self):  # pyright: ignore
@@ -89,10 +115,15 @@ class ManifoldInterpolation(dfx.AbstractPath):
             return jtu.tree_map(
                 jnp.subtract, self.evaluate(t1, left=left), self.evaluate(t0, left=left)
             )
-        y, info = self.projection(
-            self.constraint, t0, self.inner.evaluate(t0, left=left), self.args
-        )
-        return jtu.tree_map(lambda leaf: jnp.where(info.success, leaf, jnp.nan), y)
+        dtype = self.inner.ts.dtype  # pyright: ignore
+        t0 = jnp.asarray(t0, dtype)
+        if t0.ndim > 0:
+            raise ValueError(
+                f"`t0` must be one time, got shape {t0.shape}. Write `jax.vmap(sol.evaluate)(ts)`."
+            )
+        leaves, tree = self.functions
+        correct = eqx.combine(self.arrays, jtu.tree_unflatten(tree, leaves))
+        return correct(t0, self.inner.evaluate(t0, left=left))
 
     def derivative(self, t: RealScalarLike, left: bool = True) -> Y:
         t = jnp.asarray(t, dtype=jnp.result_type(float, t))

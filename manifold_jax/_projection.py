@@ -6,7 +6,6 @@ at the point `x` that is corrected, and `z` the root of the square system
 in the size of the correction.
 """
 
-import functools
 from typing import Any, Literal
 
 import equinox as eqx
@@ -14,49 +13,26 @@ import jax
 import jax.flatten_util as jfu
 import jax.numpy as jnp
 import jax.tree_util as jtu
+import numpy as np
 from jaxtyping import Array, Float
 
 from ._constraint import (
     AbstractConstraint,
+    as_time,
     check_constraint,
+    check_constraint_type,
     check_state,
     jacobian,
     residual_vector,
 )
-from ._custom_types import Args, BoolScalar, FloatScalar, IntScalar, RealScalarLike, Y
+from ._custom_types import Args, RealScalarLike, Y
+from ._diagnosis import failure_cause, raise_unless
+from ._errors import clear_errors
 from ._mechanics import MechanicalConstraint
 from ._mechanics.constraint import Kinematics
-from ._newton import correct_once, CorrectionProblem, CorrectionRoot, solve_correction
+from ._newton import correct_once, CorrectionProblem, solve_correction
+from ._projection_info import ProjectionInfo
 from ._two_stage import correct_in_two_stages, Settings
-
-
-class ProjectionInfo(eqx.Module):
-    """What a projection did.
-
-    - `multipliers`: `lambda` of shape `(m,)` in `W (p - y) + G(y)^T lambda = 0`.
-    - `iterations`: Newton iterations that were taken.
-    - `residual`: the scaled residual at the returned point, `max_i |g_i| / scale_i`.
-    - `correction`: the distance moved, `max_j |p_j - y_j| / (|y_j| + 1)`.
-    - `full_rank`: whether the rows of the Jacobian at `y` were linearly independent.
-    - `success`: whether the returned point is on the manifold. If not, it is `y` itself.
-    """
-
-    multipliers: Float[Array, " m"]
-    iterations: IntScalar
-    residual: FloatScalar
-    correction: FloatScalar
-    full_rank: BoolScalar
-    success: BoolScalar
-
-    @staticmethod
-    def of_nothing(y: Y, success: BoolScalar) -> "ProjectionInfo":
-        """For a state that has been left as it was."""
-        dtype = jnp.result_type(*jtu.tree_leaves(y))
-        zero = jnp.zeros((), dtype)
-        none = jnp.zeros((0,), dtype)
-        return ProjectionInfo(
-            none, jnp.zeros((), jnp.int32), zero, zero, jnp.asarray(True), success
-        )
 
 
 class NewtonProjection(eqx.Module):
@@ -66,6 +42,11 @@ class NewtonProjection(eqx.Module):
     factorization. Iterates until the residual is at the level of its own rounding errors or
     stops decreasing, and reports failure if the scaled residual `max_i |g_i| / scale_i`,
     `scale_i = max_j |G_ij| (|y_j| + 1)`, is then still above `tolerance`.
+
+    Components smaller than 1 count as 1 there, as they may be displacements from something whose
+    size the state does not show. A state of size `s < 1` is on the manifold to about `eps / s` of
+    its own size, and below 50 `eps` (1e-14, in single precision 6e-6) any point counts as on it.
+    Choose units in which states are not smaller than about 1e-6 (1e-2).
 
     The derivative is that of the implicit function, exact in forward and reverse mode and
     to any order, with respect to the point, the time, `args` and every parameter inside
@@ -107,6 +88,18 @@ class NewtonProjection(eqx.Module):
             raise ValueError(
                 f"`metric` must be 'identity', 'error' or a pytree of positive weights, got {self.metric!r}."
             )
+        if not isinstance(self.metric, str) and not all(
+            map(_may_be_positive, jtu.tree_leaves(self.metric))
+        ):
+            raise ValueError(
+                f"`metric` must have positive weights only, got {self.metric}: the larger one is, the less the "
+                "component is moved."
+            )
+        if not all(map(_may_be_positive, jtu.tree_leaves(self.tolerance))):
+            raise ValueError(
+                f"`tolerance` must be positive, got {self.tolerance}: it is the largest scaled residual that counts as "
+                "success. None is 50 rounding units."
+            )
         if not isinstance(self.max_steps, int) or self.max_steps < 1:
             raise ValueError(f"`max_steps` must be a positive integer, got {self.max_steps!r}.")
 
@@ -129,11 +122,11 @@ class NewtonProjection(eqx.Module):
         Jacobian, and shorter steps while the residual does not decrease. `directions` are the
         rows of `V^T` to correct along, if not those at `y`, from [`correction_directions`][].
         """
-        t = jnp.asarray(t)
         fallback = y if fallback is None else fallback
+        x, unravel = jfu.ravel_pytree(y)
+        t = as_time(t, x.dtype)
         if isinstance(constraint, MechanicalConstraint):
             return self._correct_mechanics(constraint, t, y, args, fallback, far, directions)
-        x, unravel = jfu.ravel_pytree(y)
         safe = jax.lax.stop_gradient(jfu.ravel_pytree(fallback)[0])
 
         def residual(t, x, args):
@@ -150,7 +143,7 @@ class NewtonProjection(eqx.Module):
             root = correct_once(problem, safe)
         else:
             root = solve_correction(problem, safe, self.max_steps, tolerance, far)
-        return unravel(root.p), _information(x, root)
+        return unravel(root.p), ProjectionInfo.of_correction(x, root)
 
     def _correct_mechanics(
         self,
@@ -169,7 +162,7 @@ class NewtonProjection(eqx.Module):
         halves = None if inverse_metric is None else tuple(jnp.split(inverse_metric, 2))
         settings = Settings(halves, directions, self.max_steps, self.tolerance_for(x.dtype), far)
         corrected, *roots = correct_in_two_stages(constraint, t, y, args, fallback, settings)
-        return corrected, _information(x, *roots)
+        return corrected, ProjectionInfo.of_correction(x, *roots)
 
     def correction_directions(
         self, constraint: AbstractConstraint, t: RealScalarLike, y: Y, args: Args
@@ -179,8 +172,8 @@ class NewtonProjection(eqx.Module):
 
         For mechanics with respect to the velocities only, `n` being half of the state.
         """
-        t = jnp.asarray(t)
         x, unravel = jfu.ravel_pytree(y)
+        t = as_time(t, x.dtype)
         inverse_metric = self._inverse_metric(y, x)
         if not isinstance(constraint, MechanicalConstraint):
             _, G = jacobian(lambda x: residual_vector(constraint, t, unravel(x), args), x)
@@ -219,25 +212,24 @@ class NewtonProjection(eqx.Module):
                 "`metric` must have the structure of the state, "
                 f"{jtu.tree_structure(y)}, got {jtu.tree_structure(self.metric)}."
             )
-        weights = jtu.tree_map(
-            lambda w, leaf: jnp.broadcast_to(jnp.asarray(w, leaf.dtype), leaf.shape), self.metric, y
-        )
-        return 1 / jfu.ravel_pytree(weights)[0]
+
+        def spread(weight: Any, leaf: Array) -> Array:
+            if jnp.shape(weight) not in ((), jnp.shape(leaf)):
+                raise ValueError(
+                    "`metric` must have for each leaf of the state one weight or as many as it has numbers: shape "
+                    f"{jnp.shape(leaf)} or (), got {jnp.shape(weight)}."
+                )
+            return jnp.broadcast_to(jnp.asarray(weight, leaf.dtype), leaf.shape)
+
+        return 1 / jfu.ravel_pytree(jtu.tree_map(spread, self.metric, y))[0]
 
 
-def _information(x: Float[Array, " n"], *roots: CorrectionRoot) -> ProjectionInfo:
-    moved = jnp.concatenate([root.p for root in roots]) - x
-    correction = jnp.max(jnp.abs(moved) / (jnp.abs(x) + 1))
-    return ProjectionInfo(
-        multipliers=-jnp.concatenate([root.z for root in roots]),
-        iterations=functools.reduce(jnp.add, [root.iterations for root in roots]),
-        residual=functools.reduce(jnp.maximum, [root.residual for root in roots]),
-        correction=jax.lax.stop_gradient(correction),
-        full_rank=functools.reduce(jnp.logical_and, [root.full_rank for root in roots]),
-        success=functools.reduce(jnp.logical_and, [root.success for root in roots]),
-    )
+def _may_be_positive(number: Any) -> bool:
+    """Unknown while tracing."""
+    return isinstance(number, jax.core.Tracer) or bool(np.all(np.asarray(number) > 0))
 
 
+@clear_errors
 @eqx.filter_jit
 def project(
     constraint: AbstractConstraint,
@@ -246,6 +238,7 @@ def project(
     args: Args = None,
     *,
     projection: NewtonProjection | None = None,
+    throw: bool = True,
 ) -> tuple[Y, ProjectionInfo]:
     """Move one point onto the manifold, `p = y + W^-1 G(y)^T z` with `g(t, p, args) = 0`.
 
@@ -253,24 +246,49 @@ def project(
 
     - `constraint`: the manifold.
     - `t`: the time.
-    - `y`: the point, any pytree of real floating-point arrays (`n` numbers).
+    - `y`: the point, any pytree of real floating-point arrays (`n` numbers), in units in which it
+        is not smaller than about 1e-6, see [`NewtonProjection`][].
     - `args`: passed to the constraint.
     - `projection`: metric, iteration limit and tolerance, [`NewtonProjection`][].
+    - `throw`: raise if the point cannot be moved onto the manifold. With `throw=False` look at
+        `info.success`: where it is false, `p` is `y` unchanged. There is then no host callback in
+        the compiled function.
 
     **Returns:**
 
-    `(p, info)`: the corrected point and a [`ProjectionInfo`][]. Where `info.success` is
-    false, `p` is `y` unchanged. The point may be far from the manifold: every Newton
-    iteration uses a new Jacobian, and a shorter step while the residual grows. Works under `jit`, `vmap`, `jvp` and `grad`.
+    `(p, info)`: the corrected point and a [`ProjectionInfo`][]. The point may be far from the
+    manifold: every Newton iteration uses a new Jacobian, and a shorter step while the residual
+    grows. Works under `jit`, `vmap`, `jvp` and `grad`.
 
     **Raises:**
 
-    `TypeError` or `ValueError` for states or residuals of the wrong type or shape.
+    `TypeError` or `ValueError` for states or residuals of the wrong type or shape. With `throw=True`
+    a `RuntimeError` (under `jit` too, and for a batch if one of its points fails) that says whether
+    the constraint was not finite, its Jacobian rank deficient, or the equations could not be
+    satisfied.
 
-    Use [`consistent_state`][] for initial values: it raises if it cannot succeed.
+    [`consistent_state`][] is the same for initial values.
     """
-    check_state(y, "y")
+    projection = NewtonProjection(max_steps=50) if projection is None else projection
+    return moved(projection, constraint, t, y, args, "y", throw)
+
+
+def moved(
+    projection: NewtonProjection,
+    constraint: AbstractConstraint,
+    t: RealScalarLike,
+    y: Y,
+    args: Args,
+    name: str,
+    throw: bool,
+) -> tuple[Y, ProjectionInfo]:
+    """One point that may be far from the manifold, `name` in messages."""
+    check_constraint_type(constraint)
+    check_state(y, name)
     y = jtu.tree_map(jnp.asarray, y)
     check_constraint(constraint, t, y, args)
-    projection = NewtonProjection(max_steps=50) if projection is None else projection
-    return projection(constraint, t, y, args, far=True)
+    p, info = projection(constraint, t, y, args, far=True)
+    if throw:
+        cause = failure_cause(constraint, t, y, args, info.residual, info.full_rank)
+        p = raise_unless(info.success, cause, p, name)
+    return p, info

@@ -5,10 +5,11 @@ from typing import Any
 
 import equinox as eqx
 
-from ._constraint import AbstractConstraint
+from ._constraint import AbstractConstraint, check_constraint_type
 from ._custom_types import Args, RealScalarLike, Y
 from ._projection import NewtonProjection
 from ._stabilization import InvariantStabilization
+from ._user_function import check_function
 
 
 class TangentField(eqx.Module):
@@ -58,15 +59,9 @@ def tangent_field(
 
     Source: Ascher, Chin & Reich, Numer. Math. 67 (1994) 131-149, with gain 0.
     """
-    if not callable(function):
-        raise TypeError(
-            f"`function` must be a callable `f(t, y, args)`, got {type(function).__name__}. Of a "
-            "Diffrax term pass its `vector_field`."
-        )
-    if not isinstance(constraint, AbstractConstraint):
-        raise TypeError(
-            f"`constraint` must be an `mj.Constraint`, got {type(constraint).__name__}."
-        )
+    advice = "Of a Diffrax term pass its `vector_field`."
+    check_function("function", function, "f(t, y, args)", advice=advice)
+    check_constraint_type(constraint)
     return TangentField(
         function, constraint, NewtonProjection() if projection is None else projection
     )

@@ -15,16 +15,16 @@ PACKAGE = Path(mj.__file__).parent
 FILES = sorted(PACKAGE.rglob("*.py"))
 # Layers, lowest first; a file may import from its own layer or a lower one.
 LAYERS = [
-    {"_custom_types", "_compat"},
+    {"_custom_types", "_compat", "_errors", "_user_function"},
     {"_linear", "_constraint"},
-    {"_mechanics"},
-    {"_newton"},
-    {"_two_stage"},
+    {"_violation", "_mechanics"},
+    {"_newton", "_diagnosis"},
+    {"_two_stage", "_projection_info"},
     {"_projection"},
     {"_chart", "_stabilization"},
     {"_tangent", "_interpolation", "_initial"},
     {"_solver"},
-    {"_adjoint"},
+    {"_adjoint", "_arguments", "_outcome"},
     {"_output"},
     {"_diffeqsolve"},
     {"_applications"},

@@ -26,7 +26,7 @@ def solve(constraint=CIRCLE, y0=START, args=None, **options):
     ("y0", "message"),
     [
         (np.array([1, 0]), "`y0`.*int64.*float"),
-        ([1, 0], "`y0`.*int.*float"),
+        ((1, 0), "`y0`.*int.*float"),
         (jnp.array([1.0 + 0j, 0.0]), "`y0`.*complex.*z.real, z.imag"),
         (jnp.array([True, False]), "`y0`.*bool"),
         (["a"], "`y0`.*real arrays"),
@@ -128,24 +128,6 @@ def test_nan_in_the_constraint_on_the_way():
     for options in ({}, adaptive):
         sol = solve(breaking, throw=False, **options)
         assert sol.result == dfx.RESULTS.nonlinear_divergence
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        (dict(metric="nearest"), "`metric`"),
-        (dict(max_steps=0), "`max_steps`"),
-    ],
-)
-def test_projection_options(options, message, as_a_user_meets_it):
-    with pytest.raises(ValueError, match=message):
-        mj.NewtonProjection(**options)
-
-
-def test_metric_of_the_wrong_structure():
-    projection = mj.NewtonProjection(metric=(1.0, 2.0))
-    with pytest.raises(ValueError, match="`metric` must have the structure of the state"):
-        mj.project(CIRCLE, 0.0, START, projection=projection)
 
 
 def test_violation_of_mismatched_trajectories():

@@ -71,3 +71,17 @@ def test_consistent_state_is_differentiable():
     r = np.sqrt(0.81 + 0.64)
     u = np.asarray(y) / r
     np.testing.assert_allclose(jac, (np.eye(2) - np.outer(u, u)) / r, rtol=1e-12)
+
+
+def test_whole_numbers_as_times():
+    """A time that is differentiated (rheonomic constraints of mechanics) has to be floating."""
+    system = mj.MechanicalSystem(
+        1.0, lambda t, q, args: q @ q - t**2, lambda t, q, v, args: jnp.zeros(2)
+    )
+    y = jnp.array([1.2, 1.6]), jnp.array([0.3, 0.5])
+    for function in (mj.project, mj.consistent_state, mj.NewtonProjection()):
+        whole, floating = (function(system.constraint, t, y)[0] for t in (2, 2.0))
+        assert all(map(np.array_equal, whole, floating))
+        np.testing.assert_allclose(whole[0], [1.2, 1.6], atol=1e-15)
+    moved, _ = mj.project(mj.Constraint(lambda t, y, args: y @ y - t), 4, jnp.array([3.0, 4.0]))
+    np.testing.assert_allclose(moved, [1.2, 1.6], atol=1e-15)

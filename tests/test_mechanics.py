@@ -50,7 +50,7 @@ def dense_solution(M, q, v, t):
     [
         (1.7, lambda q: 1.7 * np.eye(4)),
         (jnp.array([1.0, 1.0, 2.0, 2.0]), lambda q: np.diag([1.0, 1.0, 2.0, 2.0])),
-        (jnp.array([[1.0], [2.0]]), lambda q: np.diag([1.0, 1.0, 2.0, 2.0])),
+        (jnp.array([[1.0, 1.0], [2.0, 2.0]]), lambda q: np.diag([1.0, 1.0, 2.0, 2.0])),
         (mass_matrix, lambda q: np.asarray(mass_matrix(q, None))),
     ],
     ids=["scalar", "diagonal", "like q", "matrix"],
@@ -66,6 +66,26 @@ def test_accelerations_and_multipliers_solve_the_dense_system(mass, matrix):
     field = system.terms.vf(0.7, STATE, None)
     np.testing.assert_array_equal(field[0], STATE[1])
     np.testing.assert_allclose(field[1], a, rtol=1e-13, atol=1e-13)
+
+
+@pytest.mark.usefixtures("as_a_user_meets_it")
+def test_masses_that_could_be_of_bodies_or_of_coordinates():
+    """Masses (m1, m2) and q of shape (2, 2): they were spread over the columns of q."""
+    for masses in (jnp.ones(2), jnp.ones((2, 1)), jnp.ones((1, 2))):
+        for mass in (masses, lambda q, args, masses=masses: masses):
+            with pytest.raises(ValueError, match=r"`mass_matrix`.*masses\[:, None\], q.shape"):
+                mj.MechanicalSystem(mass, two_rods, weight).accelerations(0.7, STATE)
+    q, v = STATE
+    pair = ({"a": q[0], "b": q[1]}, {"a": v[0], "b": v[1]})
+    rods = lambda t, q, args: two_rods(t, jnp.stack([q["a"], q["b"]]), args)
+    force = lambda t, q, v, args: q
+    for b, fits in ((2.0, True), (jnp.ones(2), True), (jnp.ones(1), False)):
+        system = mj.MechanicalSystem({"a": 1.0, "b": b}, rods, force)
+        if fits:
+            system.accelerations(0.7, pair)
+        else:
+            with pytest.raises(ValueError, match=r"`mass_matrix`.*'b': \(1,\)"):
+                system.accelerations(0.7, pair)
 
 
 def test_singular_mass_matrix_with_regular_system():

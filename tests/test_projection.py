@@ -172,19 +172,69 @@ def test_sensitivity_is_tangent():
     np.testing.assert_allclose(G @ dp_dt + g_t, 0, atol=1e-14)
 
 
+NOWHERE = mj.Constraint(lambda t, y, args: y @ y + 1.0)
+
+
 def test_failure_is_reported_and_leaves_the_point():
-    nowhere = mj.Constraint(lambda t, y, args: y @ y + 1.0)
     y = jnp.array([0.3, 0.4])
-    p, info = mj.project(nowhere, 0.0, y)
+    p, info = mj.project(NOWHERE, 0.0, y, throw=False)
     assert not bool(info.success)
     assert np.array_equal(p, y)
+
+
+@pytest.mark.parametrize(
+    ("residual", "message"),
+    [
+        (NOWHERE.function, "`y` could not be made consistent"),
+        (lambda t, y, args: jnp.log(y[0] - 1.0), "not finite"),
+        (lambda t, y, args: jnp.stack([y[0], 2 * y[0]]), "full rank at `y`"),
+    ],
+)
+def test_failure_raises(residual, message):
+    with pytest.raises(RuntimeError, match=message):
+        jax.jit(lambda y: mj.project(mj.Constraint(residual), 0.0, y))(jnp.array([0.3, 0.4]))
+
+
+def test_what_a_projection_did_is_printed():
+    y = jnp.array([1.5, 2.0])
+    _, info = mj.project(CIRCLE, 0.0, y)
+    text = f"ProjectionInfo(success=True, full_rank=True, correction=0.4, residual={info.residual:.3g}, "
+    assert repr(info) == f"{text}iterations={info.iterations}, multipliers=[0.3])"
+    assert str(info) == repr(info)
+    batch = jax.vmap(lambda a: mj.project(NOWHERE, 0.0, a * y, throw=False)[1])(
+        jnp.arange(1.0, 3.0)
+    )
+    assert "success=[False, False]" in repr(batch)
+    seen = []
+    jax.jit(lambda y: seen.append(repr(mj.project(CIRCLE, 0.0, y)[1])))(y)
+    assert "f64[1]" in seen[0]
+    assert "shape=(1,)" in repr(jax.eval_shape(lambda y: mj.project(CIRCLE, 0.0, y)[1], y))
+
+
+@pytest.mark.parametrize("radius", [1e-3, 1e-6])
+def test_states_that_are_small_in_their_units(radius):
+    """What the docstring promises: on the manifold to about eps / size of a state's own size."""
+    circle = mj.Constraint(lambda t, y, args: y @ y - args**2)
+    y = radius * jnp.array([0.9, 1.2])
+    assert mj.constraint_violation(circle, 0.0, y, radius) > 0.1 * radius
+    p, _ = mj.project(circle, 0.0, y, radius)
+    assert abs(np.sqrt(p @ p) / radius - 1) <= 1e-16 / radius
+
+
+def test_displacements_pass_through_zero():
+    """Why the scale has a floor: of a length of order one rounding errors remain."""
+    rod = mj.Constraint(lambda t, y, args: (y + args) @ (y + args) - 1.0)
+    place = jnp.array([0.6, 0.8])
+    for size in (1e-2, 1e-5, 1e-9, 0.0):
+        _, info = mj.project(rod, 0.0, size * jnp.array([1.0, 0.3]), place)
+        assert bool(info.success)
 
 
 def test_failed_lane_leaves_the_others_alone():
     radius2 = jnp.array([1.0, -1.0, 4.0])
     constraint = mj.Constraint(lambda t, y, args: y @ y - args)
     y = jnp.array([0.6, 0.9])
-    p, info = jax.vmap(lambda a: mj.project(constraint, 0.0, y, a))(radius2)
+    p, info = jax.vmap(lambda a: mj.project(constraint, 0.0, y, a, throw=False))(radius2)
     good, _ = jax.vmap(lambda a: mj.project(constraint, 0.0, y, a))(jnp.array([1.0, 1.0, 4.0]))
     assert info.success.tolist() == [True, False, True]
     assert np.array_equal(p[0], good[0])

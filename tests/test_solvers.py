@@ -205,7 +205,7 @@ def test_not_a_solver(as_a_user_meets_it):
 
 
 def test_backsolve_is_refused():
-    with pytest.raises(ValueError, match="RecursiveCheckpointAdjoint"):
+    with pytest.raises(ValueError, match="StepReplayAdjoint"):
         mj.diffeqsolve(
             dfx.ODETerm(field),
             mj.Projected(dfx.Tsit5(), SPHERE),

@@ -255,3 +255,21 @@ def test_bad_stabilization():
         mj.diffeqsolve(
             system.terms, dfx.Tsit5(), 0.0, 1.0, 0.1, (jnp.array([1.0, 0.0]), jnp.zeros(2))
         )
+
+
+def test_numbers_of_python_as_a_state():
+    """With constant steps the check of the gain had no array to go with."""
+    constraint = mj.Constraint(lambda t, y, args: y[0] ** 2 + y[1] ** 2 - 1.0)
+    terms = dfx.ODETerm(lambda t, y, args: (-y[1], y[0]))
+    hook = mj.Stabilized(dfx.Tsit5(), constraint, stabilization=mj.InvariantStabilization(1.0))
+    sol = mj.diffeqsolve(terms, hook, 0.0, 1.0, 0.1, (1.0, 0.0))
+    np.testing.assert_allclose(np.ravel(sol.ys), [np.cos(1.0), np.sin(1.0)], atol=1e-6)
+    system = mj.MechanicalSystem(
+        1.0,
+        lambda t, q, args: q[0] ** 2 + q[1] ** 2 - 1.0,
+        lambda t, q, v, args: (0.0, 0.0),
+        stabilization=mj.Baumgarte(1.0, 1.0),
+    )
+    y0 = (1.0, 0.0), (0.0, 1.0)
+    sol = mj.diffeqsolve(system.terms, dfx.Tsit5(), 0.0, 1.0, 0.1, y0)
+    np.testing.assert_allclose(np.ravel(sol.ys[0]), [np.cos(1.0), np.sin(1.0)], atol=1e-6)

@@ -185,3 +185,31 @@ def test_two_builds_of_a_problem_share_compiled_code():
     jitted = eqx.filter_jit(solve)
     for gravity in (9.81, 1.62):
         jitted(mj.problems.pendulum(gravity=gravity))
+
+
+@pytest.mark.parametrize("transform", [jax.jit, jax.vmap], ids=["jit", "vmap"])
+def test_dense_solutions_are_returned_from_transforms(transform):
+    """As those of Diffrax; what the constraint closes over goes with them."""
+
+    @transform
+    def solve(radius):
+        constraint = mj.Constraint(lambda t, y, args: y @ y - radius**2)
+        return mj.diffeqsolve(
+            dfx.ODETerm(lambda t, y, args: jnp.stack([-y[1], y[0]])),
+            mj.Projected(dfx.Tsit5(), constraint),
+            0.0,
+            1.0,
+            0.2,
+            radius * jnp.array([1.0, 0.0]),
+            saveat=dfx.SaveAt(dense=True),
+            max_steps=16,
+        )
+
+    radius = jnp.array([1.0, 2.0]) if transform is jax.vmap else jnp.asarray(2.0)
+    evaluate = lambda sol, t: sol.evaluate(t)
+    if transform is jax.vmap:
+        evaluate = jax.vmap(evaluate, in_axes=(0, None))
+    sol = solve(radius)
+    y = jnp.reshape(jax.jit(evaluate)(sol, 0.33), (-1, 2))
+    np.testing.assert_allclose(np.sum(y**2, axis=1), np.ravel(radius) ** 2, rtol=1e-15)
+    np.testing.assert_allclose(y[:, 1] / y[:, 0], np.tan(0.33), rtol=1e-5)

@@ -13,6 +13,7 @@ from jaxtyping import Array, Float
 from .._compat import nonlinear_failure
 from .._constraint import check_state
 from .._custom_types import Args, IntScalar, RealScalarLike
+from .._errors import clear_errors
 from .checks import as_curve_start, as_direction, check_counts, check_function, raise_if_failed
 from .following import Curve, follow, start_on, unbroken
 from .turning_points import find_turns
@@ -58,6 +59,7 @@ class CurveTrace(eqx.Module):
     stats: dict[str, Any]
 
 
+@clear_errors
 @eqx.filter_jit
 def trace_curve(
     function: Callable[[Float[Array, " k"], Args], Float[Array, " n"]],
@@ -122,8 +124,8 @@ def trace_curve(
     Source: Sudarsan & Keerthi, Appl. Math. Comput. 92 (1998) 153-193, section 2.2; Allgower
     & Georg, Numerical Continuation Methods, Springer 1990, chapters 2, 6 and 8.
     """
-    check_state(x0, "x0")
     x0 = as_curve_start(x0, parameter)
+    check_state(x0, "x0")
     why = f"a curve has one unknown more than equations, and `x0` has {x0.size} numbers"
     check_function("function", function, (x0.size - 1,), why, x0, args)
     check_counts(2, points=points)

@@ -23,6 +23,7 @@ from .._constraint import (
 )
 from .._custom_types import Args, BoolScalar, FloatScalar, RealScalarLike, Y
 from .._diffeqsolve import diffeqsolve
+from .._errors import clear_errors
 from .._projection import NewtonProjection
 from .._solver import Projected
 from .checks import check_function, raise_if_failed
@@ -79,6 +80,7 @@ class ConstrainedMinimum(eqx.Module):
     stats: dict[str, Any]
 
 
+@clear_errors
 @eqx.filter_jit
 def gradient_flow(
     objective: Callable[[Y, Args], FloatScalar],

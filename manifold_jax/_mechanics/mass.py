@@ -63,21 +63,20 @@ def mass_values(mass_matrix: Any, q: Y) -> Float[Array, "..."]:
     """What `mass_matrix` returned as a scalar, a diagonal `(n,)` or a matrix `(n, n)`."""
     x, _ = jfu.ravel_pytree(q)
     n = x.size
-    same_structure = jtu.tree_structure(mass_matrix) == jtu.tree_structure(q)
-    if eqx.is_array_like(mass_matrix):
-        shape = jnp.shape(mass_matrix)
-        if shape in ((), (n,), (n, n)):
-            return jnp.asarray(mass_matrix, x.dtype)
-    if same_structure:
-        try:
+    if eqx.is_array_like(mass_matrix) and jnp.shape(mass_matrix) in ((), (n,), (n, n)):
+        return jnp.asarray(mass_matrix, x.dtype)
+    shapes = jtu.tree_map(jnp.shape, mass_matrix)
+    # Others are not spread: of masses of shape (2,) and q of shape (2, 2) nobody can say whether
+    # they belong to two bodies or to two coordinates.
+    if jtu.tree_structure(mass_matrix) == jtu.tree_structure(q):
+        pairs = zip(jtu.tree_leaves(mass_matrix), jtu.tree_leaves(q), strict=True)
+        if all(jnp.shape(M) in ((), jnp.shape(leaf)) for M, leaf in pairs):
             spread = lambda M, leaf: jnp.broadcast_to(jnp.asarray(M, leaf.dtype), leaf.shape)
             return jfu.ravel_pytree(jtu.tree_map(spread, mass_matrix, q))[0]
-        except ValueError:
-            pass
-    shapes = jtu.tree_map(jnp.shape, mass_matrix)
     raise ValueError(
-        f"`mass_matrix` must be a scalar, a diagonal of shape ({n},) or like q, or a matrix of shape ({n}, {n}) "
-        f"for q of {n} numbers, got {shapes}."
+        f"`mass_matrix` must be a scalar, a diagonal of shape ({n},) or of the shapes of q, or a matrix of shape ({n}, "
+        f"{n}) for q of {n} numbers of shapes {jtu.tree_map(jnp.shape, q)}, got {shapes}. Masses of points whose "
+        "positions are the rows of q: `jnp.broadcast_to(masses[:, None], q.shape)`."
     )
 
 

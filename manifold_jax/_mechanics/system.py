@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 
 from .._custom_types import Args, RealScalarLike, Y
 from .._linear import combine, factorize, gram, gram_written_out, multiply
+from .._user_function import check_function
 from .constraint import check_mechanical_state, Kinematics, MechanicalConstraint
 from .lagrangian import LagrangianForce
 from .mass import ConfigurationMass, LagrangianMass, Mass
@@ -40,9 +41,10 @@ class MechanicalSystem(eqx.Module):
 
     **Arguments:**
 
-    - `mass_matrix`: `M(q, args)` or a constant: a scalar, a diagonal of shape `(n,)` (or like
-        `q`), or a symmetric matrix `(n, n)` in the order of `ravel_pytree(q)`. A matrix may be
-        singular as long as no motion that the constraints allow is without mass (quaternions).
+    - `mass_matrix`: `M(q, args)` or a constant: a scalar, a diagonal of shape `(n,)` or of the
+        structure and shapes of `q`, or a symmetric matrix `(n, n)` in the order of
+        `ravel_pytree(q)`. A matrix may be singular as long as no motion that the constraints allow
+        is without mass (quaternions).
     - `constraint`: `phi(t, q, args)`, any pytree of real arrays; time-dependent (rheonomic)
         constraints are allowed. `None` if there are only constraints on velocities.
     - `force`: `Q(t, q, v, args)`, like `q`: applied forces and, for configuration-dependent
@@ -84,6 +86,8 @@ class MechanicalSystem(eqx.Module):
     ):
         _check_arguments(constraint, force, velocity_constraint, stabilization)
         own = isinstance(mass_matrix, LagrangianMass | ConfigurationMass)  # of another system
+        if callable(mass_matrix) and not own:
+            check_function("mass_matrix", mass_matrix, "M(q, args)")
         self.mass_matrix = mass_matrix if own else ConfigurationMass(mass_matrix)
         self.holonomic = constraint
         self.nonholonomic = velocity_constraint
@@ -113,10 +117,9 @@ class MechanicalSystem(eqx.Module):
         Masses and gyroscopic terms are second derivatives of `L`; write them out where the
         time to compile matters.
         """
-        if not callable(lagrangian):
-            raise TypeError(
-                f"`lagrangian` must be a callable `L(t, q, v, args)`, got {type(lagrangian).__name__}."
-            )
+        check_function("lagrangian", lagrangian, "L(t, q, v, args)")
+        if force is not None:
+            check_function("force", force, "Q(t, q, v, args)")
         mass = LagrangianMass(lagrangian)
         return cls(mass, constraint, LagrangianForce(lagrangian, force), **kwargs)
 
@@ -223,17 +226,11 @@ def _flat_force(force: Any, q: Y, x: Float[Array, " n"]) -> Float[Array, " n"]:
 def _check_arguments(
     constraint: Any, force: Any, velocity_constraint: Any, stabilization: Any
 ) -> None:
-    given = dict(constraint=constraint, force=force, velocity_constraint=velocity_constraint)
-    signatures = dict(
-        constraint="phi(t, q, args)",
-        force="Q(t, q, v, args)",
-        velocity_constraint="a(t, q, v, args)",
-    )
-    for name, value in given.items():
-        if not callable(value) and (value is not None or name == "force"):
-            raise TypeError(
-                f"`{name}` must be a callable `{signatures[name]}`, got {type(value).__name__}."
-            )
+    check_function("force", force, "Q(t, q, v, args)")
+    if constraint is not None:
+        check_function("constraint", constraint, "phi(t, q, args)")
+    if velocity_constraint is not None:
+        check_function("velocity_constraint", velocity_constraint, "a(t, q, v, args)")
     if constraint is None and velocity_constraint is None:
         raise ValueError(
             "`constraint` is None and there is no `velocity_constraint`: without constraints use "

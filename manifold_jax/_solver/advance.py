@@ -1,5 +1,6 @@
 """What the step hooks have in common: one step of the wrapped solver, and the verdict on it."""
 
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -13,43 +14,64 @@ from jaxtyping import Array
 
 from .._compat import is_okay, nonlinear_failure, update_result
 from .._custom_types import Args, BoolScalar, FloatScalar, IntScalar, RealScalarLike, Y
-from .._projection import ProjectionInfo
+from .._projection_info import ProjectionInfo
 from .explicit import explicit_step, is_first_same_as_last, is_unrollable, refreshed
 from .implicit import carries_derivative, step_with_derivative
 
 
 class StepStatistics(eqx.Module):
-    """Totals over the accepted steps of a solve."""
+    """Totals over the accepted steps of a solve. Corrections and displacements are those of the
+    component that moved most, `|change| / (|y| + 1)`."""
 
     iterations: IntScalar
     largest_correction: FloatScalar
+    correction: FloatScalar
+    displacement: FloatScalar
 
     @staticmethod
     def zero(y: Y) -> "StepStatistics":
-        dtype = jnp.result_type(*jtu.tree_leaves(y))
-        return StepStatistics(jnp.zeros((), jnp.int32), jnp.zeros((), dtype))
+        zero = jnp.zeros((), jnp.result_type(*jtu.tree_leaves(y)))
+        return StepStatistics(jnp.zeros((), jnp.int32), zero, zero, zero)
 
-    def including(self, info: ProjectionInfo) -> "StepStatistics":
+    @property
+    def correction_share(self) -> FloatScalar:
+        moved = self.displacement > 0
+        return jnp.where(moved, self.correction / jnp.where(moved, self.displacement, 1), 0)
+
+    def including(self, y0: Y, y1: Y, info: ProjectionInfo) -> "StepStatistics":
+        dtype = self.correction.dtype
+        correction = info.correction.astype(dtype)
         return StepStatistics(
             self.iterations + info.iterations,
-            jnp.maximum(
-                self.largest_correction, info.correction.astype(self.largest_correction.dtype)
-            ),
+            jnp.maximum(self.largest_correction, correction),
+            self.correction + correction,
+            self.displacement + _distance(y0, y1, dtype),
         )
+
+
+def _distance(y0: Y, y1: Y, dtype: Any) -> FloatScalar:
+    def largest(a: Array, b: Array) -> FloatScalar:
+        return jnp.max(jnp.abs(b - a) / (jnp.abs(a) + 1), initial=0.0).astype(dtype)
+
+    leaves = jtu.tree_leaves(jax.lax.stop_gradient(jtu.tree_map(largest, y0, y1)))
+    return functools.reduce(jnp.maximum, leaves)
 
 
 class HookState(eqx.Module):
     """Carried from step to step: the wrapped solver's own state, the size of the first step
-    that was tried (the scale of time near t = 0), and the totals."""
+    that was tried (the scale of time near t = 0), the totals, and how the last step went."""
 
     inner: Any
     first_step: FloatScalar
     statistics: StepStatistics
+    result: RESULTS
 
 
 class Step(NamedTuple):
-    """One attempted step: the state, corrected and `raw`, and what the wrapped solver returned."""
+    """One attempted step: the state before it, after it, corrected and `raw`, and what the wrapped
+    solver returned."""
 
+    y0: Y
     y1: Y
     raw: Y
     error: Y | None
@@ -69,7 +91,8 @@ def initial_state(
         inner_state = inner.func(terms, t0, y0, args)
     else:
         inner_state = inner.init(terms, t0, t1, y0, args)
-    return HookState(inner_state, jnp.abs(jnp.asarray(t1) - t0), StepStatistics.zero(y0))
+    first_step = jnp.abs(jnp.asarray(t1) - t0)
+    return HookState(inner_state, first_step, StepStatistics.zero(y0), RESULTS.successful)
 
 
 def advance(
@@ -94,7 +117,7 @@ def advance(
         y1, raw, error, dense_info, f1, info = explicit_step(
             tableau, terms, stage_terms, t0, t1, y0, args, f0, correct
         )
-        return Step(y1, raw, error, dense_info, f1 if fsal else None, RESULTS.successful, info)
+        return Step(y0, y1, raw, error, dense_info, f1 if fsal else None, RESULTS.successful, info)
     if carries_derivative(inner, terms, t0, t1, y0, args):
         raw, error, dense_info, inner_state, result = step_with_derivative(
             inner, terms, stage_terms, t0, t1, y0, args, inner_state, made_jump
@@ -107,7 +130,7 @@ def advance(
             stage_terms, t0, t1, y0, args, inner_state, made_jump=True
         )
     y1, info = correct(raw)
-    return Step(y1, raw, error, dense_info, inner_state, result, info)
+    return Step(y0, y1, raw, error, dense_info, inner_state, result, info)
 
 
 def conclude(
@@ -124,9 +147,15 @@ def conclude(
         error = rejecting(error, is_okay(result), repeatable)
     correction = jtu.tree_map(jnp.subtract, step.y1, step.raw)
     dense_info = dict(corrected=step.y1, correction=correction, **step.dense_info)
-    statistics = state.statistics.including(step.info)
-    state = HookState(step.inner_state, state.first_step, statistics)
+    statistics = state.statistics.including(step.y0, step.y1, step.info)
+    state = HookState(step.inner_state, state.first_step, statistics, result)
     return step.y1, error, dense_info, state, result
+
+
+def result_of_state(y: Y) -> RESULTS:
+    finite = [jnp.all(jnp.isfinite(leaf)) for leaf in jtu.tree_leaves(y)]
+    finite = functools.reduce(jnp.logical_and, finite)
+    return RESULTS.where(finite, RESULTS.successful, RESULTS.nonfinite)
 
 
 def is_repeatable(t0: RealScalarLike, t1: RealScalarLike, first_step: FloatScalar) -> BoolScalar:

@@ -6,7 +6,7 @@ import diffrax as dfx
 import equinox as eqx
 
 from .._compat import is_sde
-from .._constraint import AbstractConstraint
+from .._constraint import AbstractConstraint, check_constraint_type
 from .._custom_types import Args, RealScalarLike, Y
 from .._projection import NewtonProjection
 
@@ -79,11 +79,7 @@ class AbstractManifoldSolver(dfx.AbstractWrappedSolver):
 
 def check_hook_arguments(solver: Any, constraint: Any, hook: str) -> None:
     _check_inner_solver(solver, hook)
-    if not isinstance(constraint, AbstractConstraint):
-        raise TypeError(
-            f"`constraint` must be an `mj.Constraint`, got {type(constraint).__name__}. "
-            "Wrap a residual function: `mj.Constraint(lambda t, y, args: ...)`."
-        )
+    check_constraint_type(constraint)
 
 
 def _check_inner_solver(solver: Any, hook: str) -> None:

@@ -19,7 +19,7 @@ from diffrax import AbstractTerm
 from jaxtyping import Array
 
 from .._custom_types import Args, RealScalarLike, Y
-from .._projection import ProjectionInfo
+from .._projection_info import ProjectionInfo
 
 
 # Equations of the vector field times stages. Measured with Tsit5: up to 210 (rigid body) written
@@ -29,13 +29,19 @@ LARGEST_UNROLLED = 500
 
 
 def is_unrollable(solver: dfx.AbstractSolver, terms: Any, t0, t1, y0: Y, args: Args) -> bool:
-    """Explicit, one tableau, and a vector field that may be evaluated on its own."""
+    """Explicit, one tableau, steps of Diffrax and not of a subclass, and a vector field that may be
+    evaluated on its own."""
     return (
         isinstance(solver, dfx.AbstractERK)
         and not isinstance(solver, dfx.AbstractWrappedSolver)  # which answers for its inner solver
         and isinstance(solver.tableau, dfx.ButcherTableau)
+        and all(_is_inherited(type(solver), name) for name in ("init", "step", "func"))
         and not terms.is_vf_expensive(t0, t1, y0, args)
     )
+
+
+def _is_inherited(solver: type, name: str) -> bool:
+    return getattr(solver, name) is getattr(dfx.AbstractRungeKutta, name)
 
 
 def is_first_same_as_last(tableau: dfx.ButcherTableau) -> bool:
@@ -76,8 +82,10 @@ def explicit_step(
     f, first = f0, terms.prod(f0, control)
     inner_rows = rows[:-1] if fsal else rows
     increment = lambda t, y: terms.prod(at_stage(t, y), control)
-    size = num_equations(jax.make_jaxpr(at_stage)(times[0], y0).jaxpr) * (len(inner_rows) + 1)
-    evaluate = _stages if size <= LARGEST_UNROLLED else _stages_in_a_loop
+    size = num_equations(jax.make_jaxpr(at_stage)(jnp.asarray(t0), y0).jaxpr) * (
+        len(inner_rows) + 1
+    )
+    evaluate = _stages if size <= LARGEST_UNROLLED or not inner_rows else _stages_in_a_loop
     increments = evaluate(inner_rows, times[: len(inner_rows)], increment, y0, first)
     # The last stage of a first-same-as-last method is taken at the new state itself.
     raw = _kept(_combine(rows[-1] if fsal else tableau.b_sol, increments, y0), y0)
@@ -152,6 +160,7 @@ def _derivative(primals: tuple[Y, Y], tangents: tuple[Y, Y]) -> tuple[Y, Y]:
 def _combine(weights: Any, increments: list[Y], start: Y | None = None) -> Y:
     """`start + sum_i weights_i increments_i`, without the terms whose weight is zero."""
     used = [(float(w), k) for w, k in zip(weights, increments, strict=True) if w != 0]
+    used = used or [(0.0, increments[0])]
     total = jtu.tree_map(
         lambda *ks: sum(w * k for (w, _), k in zip(used, ks, strict=True)), *(k for _, k in used)
     )

@@ -15,7 +15,8 @@ from .._compat import time_direction
 from .._constraint import AbstractConstraint, check_constraint
 from .._custom_types import Args, BoolScalar, RealScalarLike, Y
 from .._interpolation import CorrectedInterpolationFactory
-from .._projection import NewtonProjection, ProjectionInfo
+from .._projection import NewtonProjection
+from .._projection_info import ProjectionInfo
 from .advance import advance, conclude, HookState, initial_state
 from .base import AbstractManifoldSolver, check_hook_arguments, check_noise
 from .implicit import with_accurate_stages

@@ -6,17 +6,18 @@ import diffrax as dfx
 import jax.numpy as jnp
 from diffrax import RESULTS
 
-from .._compat import is_sde, time_direction
+from .._compat import is_sde, time_direction, update_result
 from .._constraint import AbstractConstraint, check_constraint
 from .._custom_types import Args, RealScalarLike, Y
 from .._interpolation import CorrectedInterpolationFactory
-from .._projection import NewtonProjection, ProjectionInfo
+from .._projection import NewtonProjection
+from .._projection_info import ProjectionInfo
 from .._stabilization import (
     AbstractStabilization,
     ExactStabilization,
     is_stable,
 )
-from .advance import advance, conclude, HookState, initial_state
+from .advance import advance, conclude, HookState, initial_state, result_of_state
 from .base import AbstractManifoldSolver, check_hook_arguments
 from .implicit import with_accurate_stages
 from .rewrite import has_several, rewrite_terms, RewrittenTerm
@@ -124,6 +125,8 @@ class Stabilized(AbstractManifoldSolver):
         step = advance(
             self.inner, terms, terms, t0, t1, y0, args, solver_state.inner, made_jump, correct
         )
+        if not self.corrects_output:  # nothing has looked at the state
+            step = step._replace(result=update_result(step.result, result_of_state(step.y1)))
         raise_error = self.corrects_output and self.projection.rtol is not None
         return conclude(step, t0, t1, solver_state, raise_error)
 

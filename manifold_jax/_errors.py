@@ -1,0 +1,42 @@
+"""What a user reads of an error that occurs while a compiled function runs."""
+
+import functools
+import inspect
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+
+
+def clear_errors(function: Callable) -> Callable:
+    """Around a function made by `equinox.filter_jit`: the message of an error comes last, where it
+    is looked for, and a call with the wrong arguments is told the right ones."""
+    signature = inspect.signature(function)
+
+    @functools.wraps(function)
+    def call(*args: Any, **kwargs: Any) -> Any:
+        __tracebackhide__ = True
+        try:
+            return function(*args, **kwargs)
+        except eqx.EquinoxRuntimeError as error:
+            raise eqx.EquinoxRuntimeError(_message_last(str(error))) from None
+        except TypeError:
+            _check_call(function.__name__, signature, args, kwargs)
+            raise
+
+    return call
+
+
+def _message_last(text: str) -> str:
+    """Without the advice on debugging that Equinox puts behind the message."""
+    stack, found, rest = text.rpartition("equinox.EquinoxRuntimeError: ")
+    message, _, _ = rest.partition("\n-------------------\n")
+    return f"{stack}\n{message.strip()}" if found else text
+
+
+def _check_call(name: str, signature: inspect.Signature, args: Any, kwargs: Any) -> None:
+    try:
+        signature.bind(*args, **kwargs)
+    except TypeError as error:
+        names = ", ".join(signature.parameters)
+        raise TypeError(f"`mj.{name}` takes the arguments `({names})`: {error}.") from None

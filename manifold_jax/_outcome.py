@@ -1,0 +1,99 @@
+"""How a solve ended: what is no success although Diffrax calls it one, and the message of a failure."""
+
+from typing import Any
+
+import diffrax as dfx
+import equinox as eqx
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from diffrax import RESULTS
+from jaxtyping import Array
+
+from ._compat import messages_of_results, nonlinear_failure, number_of_result, save_y
+from ._custom_types import BoolScalar, IntScalar
+from ._projection import NewtonProjection
+from ._solver import Projected
+from ._solver.advance import StepStatistics
+from ._solver.base import AbstractManifoldSolver
+
+
+_NOT_CORRECTED = (
+    "A step could not be moved onto the manifold: near its end `constraint` or the vector field is not finite, or the "
+    "equations of `constraint` cannot hold or depend on each other, or those of an implicit stage have no solution. "
+    "With constant steps try a smaller `dt0` or an adaptive `stepsize_controller`."
+)
+_TOO_LONG = (
+    "A step was beyond the stability interval of `stabilization`: gain * step must stay below that of the solver on the "
+    "negative real axis. Use a smaller gain or shorter steps."
+)
+_NOT_FINITE = (
+    "The state is not finite (NaN or infinite) from some time on: the vector field is not defined on the way. For an "
+    "`mj.MechanicalSystem` the mass matrix is not positive definite there, or constraints depend on each other."
+)
+_NOT_TANGENT = (
+    "The maximum number of solver steps was reached, and the corrections undid a large part of every step: the vector "
+    "field in `terms` is not tangent to the manifold. Make it so with `mj.tangent_field(f, constraint)`, or see "
+    "whether `terms` and `constraint` belong together."
+)
+
+
+def result_of_saved(saveat: dfx.SaveAt, ts: Any, ys: Any) -> RESULTS:
+    """`RESULTS.nonfinite` where a saved state is NaN or infinite at a time that was reached."""
+    finite = jnp.asarray(True)
+
+    def check(sub: dfx.SubSaveAt, ts: Array, ys: Any) -> None:
+        nonlocal finite
+        if sub.fn is not save_y:
+            return
+        for leaf in jtu.tree_leaves(ys):
+            row = jnp.all(jnp.isfinite(leaf), axis=tuple(range(1, leaf.ndim)))
+            finite &= jnp.all(row | ~jnp.isfinite(ts))
+
+    jtu.tree_map(check, saveat.subs, ts, ys, is_leaf=lambda x: isinstance(x, dfx.SubSaveAt))
+    return RESULTS.where(finite, RESULTS.successful, RESULTS.nonfinite)
+
+
+def fault_messages(
+    result: RESULTS,
+    solver: AbstractManifoldSolver,
+    statistics: StepStatistics,
+    num_accepted_steps: IntScalar,
+) -> list[tuple[BoolScalar, str]]:
+    """What to say instead of Diffrax's messages, and where it applies."""
+    not_corrected = _NOT_CORRECTED if solver.corrects_output else _TOO_LONG
+    faults = [(result == nonlinear_failure(), not_corrected)]
+    if isinstance(solver, Projected):
+        undone = _undo_steps(statistics, num_accepted_steps, solver.projection)
+        faults.append((undone & (result == RESULTS.max_steps_reached), _NOT_TANGENT))
+    return faults
+
+
+def _undo_steps(
+    statistics: StepStatistics, num_accepted_steps: IntScalar, projection: NewtonProjection
+) -> BoolScalar:
+    """Whether the corrections took back more of the steps than they do for tangent fields.
+
+    There they are as small as errors: over the gallery with tolerances from 1e-8 to 1e-3 up to 7
+    times the tolerance per length travelled. If a part of the field is normal, they are that part
+    of the length whatever the tolerance.
+    """
+    dtype = statistics.correction.dtype
+    share = jnp.asarray(1e-2, dtype)
+    if projection.rtol is not None and projection.atol is not None:
+        tolerance = jnp.asarray(projection.rtol, dtype) + jnp.asarray(projection.atol, dtype)
+        share = jnp.minimum(share, 1e3 * tolerance)
+    rounding = 1e3 * jnp.finfo(dtype).eps * jnp.asarray(num_accepted_steps, dtype)
+    return statistics.correction > share * statistics.displacement + rounding
+
+
+def raise_if_failed(
+    sol: dfx.Solution, failed: BoolScalar, faults: list[tuple[BoolScalar, str]]
+) -> dfx.Solution:
+    """Attach the message of the last of the `faults` that applies, or that of the result."""
+    faults = [*faults, (sol.result == RESULTS.nonfinite, _NOT_FINITE)]
+    messages, number = messages_of_results(), number_of_result(sol.result)
+    for fault, message in faults:
+        number = jnp.where(fault, len(messages), number)
+        messages.append(message)
+    # Of a batch the largest number is reported.
+    return eqx.branched_error_if(sol, failed, jnp.where(failed, number, 0), messages)

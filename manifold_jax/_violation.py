@@ -1,0 +1,68 @@
+"""How far states are from the manifold."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.flatten_util as jfu
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jaxtyping import Array
+
+from ._constraint import (
+    AbstractConstraint,
+    check_constraint,
+    check_constraint_type,
+    check_state,
+    jacobian,
+    residual_vector,
+    row_scale,
+)
+from ._custom_types import Args, FloatScalar, Y
+from ._errors import clear_errors
+
+
+@clear_errors
+@eqx.filter_jit
+def constraint_violation(
+    constraint: AbstractConstraint, t: Any, y: Y, args: Args = None
+) -> FloatScalar:
+    """How far from the manifold: `max_i |g_i| / scale_i`, `scale_i = max_j |G_ij| (|y_j| + 1)`.
+
+    **Arguments:**
+
+    - `constraint`: the constraint.
+    - `t`: a time, or the times of a saved trajectory, shape `(times,)`.
+    - `y`: the state, or the saved states with a leading axis of length `times`.
+    - `args`: as for the constraint.
+
+    **Returns:**
+
+    One number, the largest over the residuals and over all finite times (the unused
+    end of a `SaveAt(steps=True)` buffer is skipped). Round-off is about `1e-16` in
+    double precision. For absolute residuals call the constraint itself.
+
+    Not relative to states smaller than 1: of a state of size `s` a point off by all of its size
+    has a violation of about `s`. Rescale those below 1e-6, see [`NewtonProjection`][].
+    """
+    check_constraint_type(constraint)
+    check_state(y, "y")
+    t = jnp.asarray(t)
+    if t.ndim > 1:
+        raise ValueError(f"`t` must be a scalar or of shape (times,), got shape {t.shape}.")
+    if t.ndim == 0:
+        return _violation(constraint, t, y, args)
+    for leaf in jtu.tree_leaves(y):
+        if jnp.shape(leaf)[:1] != t.shape:
+            raise ValueError(
+                f"`y` must have a leading axis of length {t.shape[0]} as `t` has, got a leaf of shape {jnp.shape(leaf)}."
+            )
+    violations = jax.vmap(lambda t, y: _violation(constraint, t, y, args))(t, y)
+    return jnp.max(jnp.where(jnp.isfinite(t), violations, 0.0), initial=0.0)
+
+
+def _violation(constraint: AbstractConstraint, t: Array, y: Y, args: Args) -> FloatScalar:
+    check_constraint(constraint, t, y, args)
+    x, unravel = jfu.ravel_pytree(y)
+    r, G = jacobian(lambda x: residual_vector(constraint, t, unravel(x), args), x)
+    return jnp.max(jnp.abs(r) / row_scale(G, x))

@@ -1,0 +1,176 @@
+"""Arguments of the wrong kind: what the user reads names the argument and what to write instead."""
+
+import diffrax as dfx
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import manifold_jax as mj
+
+
+pytestmark = pytest.mark.usefixtures("as_a_user_meets_it")
+CIRCLE = mj.Constraint(lambda t, y, args: y @ y - 1.0)
+TURN = dfx.ODETerm(lambda t, y, args: jnp.stack([-y[1], y[0]]))
+PROJECTED = mj.Projected(dfx.Tsit5(), CIRCLE)
+START = jnp.array([1.0, 0.0])
+SYSTEM = mj.MechanicalSystem(
+    1.0, lambda t, q, args: q @ q - 1.0, lambda t, q, v, args: jnp.zeros(2)
+)
+
+
+def solve(terms=TURN, solver=PROJECTED, dt0=0.1, y0=START, **options):
+    return mj.diffeqsolve(terms, solver, 0.0, 1.0, dt0, y0, **options)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (dict(terms=SYSTEM), "`terms`.*`system.terms`"),
+        (dict(terms=TURN.vector_field), r"`terms`.*diffrax.ODETerm\("),
+        (dict(terms=None), r"`terms` is empty.*diffrax.ODETerm\("),
+        (dict(terms=PROJECTED, solver=TURN), "`terms` is a Projected.*terms come first"),
+        (dict(terms=dfx.ODETerm(lambda t, y: y)), r"`terms`.*`f\(t, y, args\)`.*`\(t, y\)`"),
+        (dict(solver=dfx.Tsit5), "`solver`.*class Tsit5.*call it"),
+        (dict(solver=CIRCLE), "`solver`.*got Constraint.*mj.Projected"),
+        (dict(saveat=jnp.linspace(0.0, 1.0, 3)), r"`saveat`.*diffrax.SaveAt\(ts="),
+        (dict(saveat=dfx.SaveAt(t1=True, fn=lambda y: y)), r"`saveat.fn`.*`fn\(t, y, args\)`"),
+        (dict(stepsize_controller=1e-6), r"`stepsize_controller`.*diffrax.PIDController\("),
+        (dict(adjoint="backsolve"), "`adjoint`.*'backsolve'.*mj.StepReplayAdjoint"),
+        (dict(event=lambda t, y, args, **kwargs: y[0]), r"`event`.*diffrax.Event\(cond_fn\)"),
+        (dict(event=dfx.Event(lambda t, y, args: y[0])), r"`event`.*\*\*kwargs"),
+    ],
+)
+def test_arguments_of_the_wrong_kind(arguments, message):
+    with pytest.raises(TypeError, match=f"(?s){message}"):
+        solve(**arguments)
+
+
+@pytest.mark.parametrize("dt0", [0, 0.0, float("nan")])
+def test_a_first_step_of_no_length(dt0):
+    for solver in (PROJECTED, dfx.Tsit5()):
+        with pytest.raises(ValueError, match="`dt0` must be the length of the first step"):
+            solve(solver=solver, dt0=dt0)
+
+
+def test_implicit_adjoint_is_refused():
+    with pytest.raises(ValueError, match=r"(?s)ImplicitAdjoint.*StepReplayAdjoint"):
+        solve(adjoint=dfx.ImplicitAdjoint())
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda system: mj.Projected(dfx.Tsit5(), system),
+        lambda system: mj.LocalCoordinates(dfx.Tsit5(), system),
+        lambda system: mj.tangent_field(TURN.vector_field, system),
+        lambda system: mj.project(system, 0.0, (START, START)),
+        lambda system: mj.consistent_state(system, 0.0, (START, START)),
+        lambda system: mj.constraint_violation(system, 0.0, (START, START)),
+    ],
+)
+def test_a_system_instead_of_its_constraint(make):
+    with pytest.raises(TypeError, match="`constraint`.*MechanicalSystem.*`system.constraint`"):
+        make(SYSTEM)
+
+
+def test_swapped_arguments():
+    for function in (mj.project, mj.consistent_state, mj.constraint_violation):
+        with pytest.raises(TypeError, match="missing a required argument: 'y'") as error:
+            function(START, CIRCLE)
+        assert f"mj.{function.__name__}` takes the arguments `(constraint, t, y" in str(error.value)
+        with pytest.raises(TypeError, match="`constraint`.*comes first"):
+            function(START, 0.0, CIRCLE)
+
+
+def test_several_times_at_once():
+    sol = solve(saveat=dfx.SaveAt(dense=True), max_steps=16)
+    with pytest.raises(ValueError, match=r"`t0` must be one time.*jax.vmap\(sol.evaluate\)\(ts\)"):
+        sol.evaluate(jnp.linspace(0.0, 1.0, 3))
+
+
+two = lambda t, y: y
+three = lambda t, q, args: q[0]
+four = lambda t, q, v, args: q
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: mj.Constraint(two), r"`function`.*`g\(t, y, args\)`.*`\(t, y\)`"),
+        (lambda: mj.Invariants(two, y0=START), r"`function`.*`I\(t, y, args\)`"),
+        (lambda: mj.tangent_field(two, CIRCLE), r"`function`.*`f\(t, y, args\)`"),
+        (lambda: mj.MechanicalSystem(1.0, four, four), r"`constraint`.*`phi\(t, q, args\)`"),
+        (lambda: mj.MechanicalSystem(1.0, three, three), r"`force`.*`Q\(t, q, v, args\)`"),
+        (lambda: mj.MechanicalSystem(three, three, four), r"`mass_matrix`.*`M\(q, args\)`"),
+        (
+            lambda: mj.MechanicalSystem(1.0, None, four, velocity_constraint=three),
+            r"`velocity_constraint`.*`a\(t, q, v, args\)`",
+        ),
+        (
+            lambda: mj.MechanicalSystem.from_lagrangian(three, three),
+            r"`lagrangian`.*`L\(t, q, v, args\)`",
+        ),
+    ],
+)
+def test_functions_with_the_wrong_number_of_arguments(make, message):
+    with pytest.raises(TypeError, match=message):
+        make()
+
+
+def test_functions_without_a_signature_are_taken_as_they_are():
+    """`max` has none, and classes, partial functions and defaults are functions, too."""
+    mj.Constraint(max)
+    mj.Constraint(lambda t, y, args=None, scale=1.0: scale * y)
+    mj.Constraint(lambda *args: args[1])
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (dict(metric="nearest"), "`metric` must be 'identity', 'error'"),
+        (dict(metric=-1.0), "`metric` must have positive weights"),
+        (dict(metric=(jnp.ones(2), np.array([1.0, 0.0]))), "`metric` must have positive weights"),
+        (dict(max_steps=0), "`max_steps` must be a positive integer"),
+        (dict(tolerance=0.0), "`tolerance` must be positive"),
+        (dict(tolerance=-1e-9), "`tolerance` must be positive"),
+        (dict(tolerance=float("nan")), "`tolerance` must be positive"),
+    ],
+)
+def test_options_of_a_projection(options, message):
+    with pytest.raises(ValueError, match=message):
+        mj.NewtonProjection(**options)
+
+
+def test_metrics_that_do_not_fit_the_state():
+    flat, pair = START, (jnp.ones((2, 2)), jnp.ones(2))
+    anywhere = mj.Constraint(lambda t, y, args: jnp.sum(y[0]) - 1.0)
+    for metric, state, message in (
+        ((1.0, 2.0), flat, "structure of the state"),
+        (jnp.ones(3), flat, r"shape \(2,\) or \(\), got \(3,\)"),
+        # Not spread over the columns: rows might have been meant.
+        ((jnp.ones(2), 1.0), pair, r"shape \(2, 2\) or \(\), got \(2,\)"),
+    ):
+        with pytest.raises(ValueError, match=f"`metric`.*{message}"):
+            mj.project(anywhere, 0.0, state, projection=mj.NewtonProjection(metric=metric))
+
+
+def test_lists_of_numbers():
+    for call, name in (
+        (lambda y: solve(y0=y), "y0"),
+        (lambda y: mj.project(CIRCLE, 0.0, y), "y"),
+        (lambda y: mj.constraint_violation(CIRCLE, 0.0, y), "y"),
+    ):
+        for y in ([1.0, 0.0], ([1.0, 0.0], 2.0), [[1.0, 0.0], [0.0, 1.0]], [np.float64(1.0)]):
+            with pytest.raises(TypeError, match=rf"`{name}` has a list of numbers.*jnp.array\("):
+                call(y)
+
+
+def test_states_of_another_shape_than_the_constraint_expects():
+    pair = mj.Constraint(lambda t, y, args: y["q"] @ y["q"] - 1.0)
+    with pytest.raises(TypeError) as error:
+        mj.constraint_violation(pair, 0.0, START)
+    assert "`constraint`" in error.value.__notes__[0]
+    with pytest.raises(TypeError) as error:  # a trajectory without its times
+        mj.constraint_violation(CIRCLE, 0.0, jnp.ones((5, 2)))
+    assert "shapes (5, 2)" in error.value.__notes__[0]
+    assert "sol.ts, sol.ys" in error.value.__notes__[0]

@@ -1,0 +1,61 @@
+"""What the terminal shows of an error: the library's own message comes last, or nearly."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import equinox as eqx
+import jax.numpy as jnp
+import pytest
+
+import manifold_jax as mj
+
+
+NOWHERE = mj.Constraint(lambda t, y, args: y @ y + 1.0)
+START = jnp.array([1.0, 0.0])
+MESSAGE = "check that the equations can hold at the same time."
+
+
+@pytest.mark.parametrize("function", [mj.consistent_state, mj.project])
+def test_the_message_is_the_end(function):
+    with pytest.raises(RuntimeError) as error:
+        function(NOWHERE, 0.0, START)
+    assert str(error.value).endswith(MESSAGE)
+    assert "EQX_ON_ERROR" not in str(error.value)
+
+
+def test_errors_of_users_keep_the_place_where_they_occurred():
+    def residual(t, y, args):
+        return y @ y - eqx.error_if(args, args < 0, "no negative radius, please")
+
+    with pytest.raises(RuntimeError, match="(?s)in residual.*no negative radius, please$"):
+        mj.project(mj.Constraint(residual), 0.0, START, jnp.asarray(-1.0))
+
+
+PROGRAM = """
+import jax.numpy as jnp
+import diffrax as dfx, manifold_jax as mj
+
+constraint = mj.Constraint(lambda t, y, args: y @ y + 1.0)
+terms = dfx.ODETerm(lambda t, y, args: jnp.stack([-y[1], y[0]]))
+y0 = {y0}
+mj.diffeqsolve(terms, mj.Projected(dfx.Heun(), constraint), 0.0, 1.0, 0.1, y0)
+"""
+
+
+@pytest.mark.parametrize(
+    ("y0", "message"),
+    [("jnp.array([1.0, 0.0])", MESSAGE), ("jnp.array([1, 0])", "jnp.asarray(leaf, float), y0)`.")],
+)
+def test_a_script(y0, message):
+    """While running, and while tracing, where JAX adds a note of two lines."""
+    root = Path(mj.__file__).parents[1]
+    process = subprocess.run(
+        [sys.executable, "-c", PROGRAM.format(y0=y0)],
+        env={**os.environ, "PYTHONPATH": str(root)},
+        capture_output=True,
+        text=True,
+    )
+    assert process.returncode == 1
+    assert any(line.endswith(message) for line in process.stderr.splitlines()[-3:])

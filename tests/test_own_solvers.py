@@ -1,0 +1,135 @@
+"""Solvers of the user's own: their steps are made as they are written, whatever their tableau."""
+
+import diffrax as dfx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import manifold_jax as mj
+
+
+CIRCLE = mj.Constraint(lambda t, y, args: y @ y - 1.0)
+TURN = dfx.ODETerm(lambda t, y, args: args * jnp.stack([-y[1], y[0]]))
+START = jnp.array([0.6, 0.8])
+
+
+def to_circle(y):
+    return y / np.sqrt(y @ y)
+
+
+class Damped(dfx.Heun):
+    """A step that is not the tableau's: a part of the second component is lost."""
+
+    def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
+        y1, *rest = super().step(terms, t0, t1, y0, args, solver_state, made_jump)
+        return y1 * jnp.array([1.0, 0.95]), *rest
+
+
+class Remembering(dfx.Heun):
+    """A field of its own for the first step, by `init` and `func`."""
+
+    def func(self, terms, t0, y0, args):
+        return jax.tree.map(lambda f: 1.5 * f, terms.vf(t0, y0, args))
+
+    def init(self, terms, t0, t1, y0, args):
+        return self.func(terms, t0, y0, args)
+
+    def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
+        _, error, info, _, result = super().step(terms, t0, t1, y0, args, None, made_jump)
+        y1 = y0 + (t1 - t0) * solver_state
+        return y1, error, info, terms.vf(t1, y1, args), result
+
+
+def one_step(solver, **options):
+    options = {"consistent": "assume", **options}
+    return mj.diffeqsolve(
+        TURN, mj.Projected(solver, CIRCLE), 0.0, 0.1, 0.1, START, jnp.asarray(2.0), **options
+    )
+
+
+def test_a_step_of_the_users_own_is_made():
+    f = lambda y: 2.0 * np.array([-y[1], y[0]])
+    y = np.asarray(START)
+    heun = y + 0.05 * (f(y) + f(y + 0.1 * f(y)))
+    np.testing.assert_allclose(one_step(Damped()).ys[0], to_circle(heun * [1, 0.95]), atol=1e-15)
+    np.testing.assert_allclose(
+        one_step(Remembering()).ys[0], to_circle(y + 0.15 * f(y)), atol=1e-15
+    )
+
+
+def test_replay_repeats_a_step_of_the_users_own():
+    """Not that of the tableau: the gradient belonged to another map than the solve."""
+
+    def end(rate, adjoint):
+        solver = mj.diffeqsolve(
+            TURN, Damped(), 0.0, 1.0, 0.1, START, rate, adjoint=adjoint, max_steps=16
+        )
+        return solver.ys[0] @ jnp.array([1.0, 2.0])
+
+    rate = jnp.asarray(1.3)
+    gradient = lambda adjoint: jax.jit(jax.grad(lambda rate: end(rate, adjoint)))(rate)
+    expected = gradient(dfx.RecursiveCheckpointAdjoint())
+    np.testing.assert_allclose(gradient(mj.StepReplayAdjoint()), expected, rtol=1e-13)
+
+
+def with_tableau(c, a_lower, b_sol, b_error):
+    class Own(dfx.AbstractERK):
+        tableau = dfx.ButcherTableau(
+            c=np.asarray(c, float),
+            a_lower=tuple(np.asarray(row, float) for row in a_lower),
+            b_sol=np.asarray(b_sol, float),
+            b_error=np.asarray(b_error, float),
+        )
+        interpolation_cls = dfx.ThirdOrderHermitePolynomialInterpolation.from_k
+
+        def order(self, terms):
+            return 1
+
+    return Own()
+
+
+def many_equations(t, y, args):
+    """As long as a field whose stages are run in a loop."""
+    for _ in range(400):
+        y = 2.0 * (0.5 * y)
+    return jnp.stack([-y[1], y[0]])
+
+
+@pytest.mark.parametrize(
+    "solver",
+    [
+        with_tableau([0.5], [[0.5]], [0, 1], [0, 0]),
+        with_tableau([1.0], [[1.0]], [1, 0], [0.5, -0.5]),  # first same as last: one stage
+        with_tableau([0.5, 0.0], [[0.5], [0.0, 0.0]], [0, 1, 0], [1, -1, 0]),
+    ],
+    ids=["without error estimate", "one stage of its own", "stage at the start"],
+)
+@pytest.mark.parametrize("field", [TURN.vector_field, many_equations], ids=["short", "long"])
+def test_tableaux(solver, field):
+    args = dfx.ODETerm(field), 0.0, 0.1, 0.1, START, jnp.asarray(1.0)
+    terms, *rest = args
+    plain = dfx.diffeqsolve(terms, solver, *rest)
+    projected = mj.diffeqsolve(terms, mj.Projected(solver, CIRCLE), *rest)
+    np.testing.assert_allclose(projected.ys[0], to_circle(plain.ys[0]), atol=1e-15)
+
+
+class OneStage(dfx.ButcherTableau):
+    """Diffrax asks for the last row of `a_lower`, which has none."""
+
+    def __post_init__(self):
+        for name, value in dict(ssal=False, fsal=False, implicit=False, num_stages=1).items():
+            object.__setattr__(self, name, value)
+
+
+class OwnEuler(dfx.AbstractERK):
+    tableau = OneStage(c=np.zeros(0), a_lower=(), b_sol=np.ones(1), b_error=np.zeros(1))
+    interpolation_cls = dfx.ThirdOrderHermitePolynomialInterpolation.from_k
+
+    def order(self, terms):
+        return 1
+
+
+def test_one_stage():
+    y = START + 0.1 * 2.0 * np.array([-START[1], START[0]])
+    np.testing.assert_allclose(one_step(OwnEuler()).ys[0], to_circle(y), atol=1e-15)
