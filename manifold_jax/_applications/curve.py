@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from diffrax import RESULTS
 from jaxtyping import Array, Float
 
+from .._adjoint import StepReplayAdjoint
 from .._compat import nonlinear_failure
 from .._constraint import check_state
 from .._custom_types import Args, IntScalar, RealScalarLike
@@ -99,8 +100,8 @@ def trace_curve(
     - `max_steps`: the most steps.
     - `parameter`: the component whose turning points are reported.
     - `max_turning_points`: room for them.
-    - `adjoint`: how to differentiate, by default `RecursiveCheckpointAdjoint()` for reverse
-        mode. Pass `diffrax.ForwardMode()` for forward mode.
+    - `adjoint`: how to differentiate, by default in reverse mode by
+        [`StepReplayAdjoint`][]. Pass `diffrax.ForwardMode()` for forward mode.
     - `throw`: raise where the trace fails. Otherwise look at `result`.
 
     **Returns:**
@@ -139,7 +140,7 @@ def trace_curve(
     positive = (length > 0) & jnp.isfinite(length)
     arclengths = jnp.linspace(0, jnp.where(positive, length, 1), points, dtype=x0.dtype)
     solver = dfx.Tsit5() if solver is None else solver
-    adjoint = dfx.RecursiveCheckpointAdjoint() if adjoint is None else adjoint
+    adjoint = StepReplayAdjoint() if adjoint is None else adjoint
     options = dict(max_steps=max_steps, adjoint=adjoint)
     sol, nodes = follow(curve, start, arclengths, solver, rtol, atol, options)
     used, smooth = unbroken(nodes, rtol, atol)

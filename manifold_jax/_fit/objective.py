@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, Float
 
+from .._adjoint import StepReplayAdjoint
 from .._custom_types import FloatScalar
 from .model import Piece, Prediction, Simulator
 from .parameters import Transform
@@ -179,14 +180,14 @@ def _backwards_all(objective: Objective, x: Any, pieces: Piece) -> Prediction:
 def _backwards(x: Any, rest: Any) -> Prediction:
     """For many unknowns: one sweep backwards instead of one forwards for each."""
     piece, simulator, transform = rest
-    return simulator.predict(x, piece, transform, dfx.RecursiveCheckpointAdjoint())
+    return simulator.predict(x, piece, transform, StepReplayAdjoint())
 
 
 @_backwards.def_fwd
 def _backwards_fwd(perturbed: Any, x: Any, rest: Any) -> Any:
     del perturbed
     piece, simulator, transform = rest
-    adjoint = dfx.RecursiveCheckpointAdjoint()
+    adjoint = StepReplayAdjoint()
     out, pullback = jax.vjp(lambda x: simulator.predict(x, piece, transform, adjoint), x)
     return out, (pullback, out)
 
