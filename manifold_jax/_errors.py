@@ -5,12 +5,14 @@ import inspect
 from collections.abc import Callable
 from typing import Any
 
+import diffrax as dfx
 import equinox as eqx
 
 
 def clear_errors(function: Callable) -> Callable:
     """Around a function made by `equinox.filter_jit`: the message of an error comes last, where it
-    is looked for, and a call with the wrong arguments is told the right ones."""
+    is looked for, a call with the wrong arguments is told the right ones, and one that is
+    differentiated forwards what to write for that."""
     signature = inspect.signature(function)
 
     @functools.wraps(function)
@@ -20,11 +22,23 @@ def clear_errors(function: Callable) -> Callable:
             return function(*args, **kwargs)
         except eqx.EquinoxRuntimeError as error:
             raise eqx.EquinoxRuntimeError(_message_last(str(error))) from None
-        except TypeError:
+        except TypeError as error:
             _check_call(function.__name__, signature, args, kwargs)
+            if "custom_vjp" in str(error) and _is_reverse(signature.parameters, kwargs):
+                raise TypeError(_FORWARDS) from error
             raise
 
     return call
+
+
+_FORWARDS = (
+    "The default `adjoint` has derivatives in reverse mode (`jax.grad`, `jax.vjp`, `jax.jacrev`). For forward mode "
+    "(`jax.jvp`, `jax.jacfwd`, `jax.linearize`) pass `adjoint=diffrax.ForwardMode()`."
+)
+
+
+def _is_reverse(parameters: Any, kwargs: Any) -> bool:
+    return "adjoint" in parameters and not isinstance(kwargs.get("adjoint"), dfx.ForwardMode)
 
 
 def _message_last(text: str) -> str:

@@ -5,7 +5,9 @@ import subprocess
 import sys
 from pathlib import Path
 
+import diffrax as dfx
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import pytest
 
@@ -31,6 +33,17 @@ def test_errors_of_users_keep_the_place_where_they_occurred():
 
     with pytest.raises(RuntimeError, match="(?s)in residual.*no negative radius, please$"):
         mj.project(mj.Constraint(residual), 0.0, START, jnp.asarray(-1.0))
+
+
+def test_forward_mode_through_the_default_adjoint():
+    def end(y0):
+        terms = dfx.ODETerm(lambda t, y, args: jnp.stack([-y[1], y[0]]))
+        circle = mj.Constraint(lambda t, y, args: y @ y - 1.0)
+        return mj.diffeqsolve(terms, mj.Projected(dfx.Euler(), circle), 0.0, 0.1, 0.1, y0).ys
+
+    for transform in (jax.jacfwd, lambda f: jax.jit(jax.jacfwd(f))):
+        with pytest.raises(TypeError, match=r"adjoint=diffrax.ForwardMode\(\)"):
+            transform(end)(START)
 
 
 PROGRAM = """

@@ -7,33 +7,13 @@ import jax
 import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jaxtyping import Array, Bool, Float
 
 from .._compat import unvmap_max
-from .._custom_types import FloatScalar, IntScalar, RealScalarLike, Y
+from .._custom_types import IntScalar
+from .gradient import add, Ends, Gradient, Step, TimesBar
 from .record import Record, Vectors
-from .replay import Replay, State
-
-
-class Rows(NamedTuple):
-    """What one of the savings has saved: times, how many rows come before that of the end, and
-    the cotangents of times and values."""
-
-    times: Float[Array, " rows"]
-    count: IntScalar
-    times_bar: Float[Array, " rows"]
-    values_bar: Any  # leading axis: rows
-
-
-class Ends(NamedTuple):
-    """Where a solve began and ended, its numbers of steps, and the state at its end."""
-
-    t0: FloatScalar
-    t1: FloatScalar  # where it was to end
-    last: FloatScalar
-    num_steps: IntScalar
-    num_accepted: IntScalar
-    y: Y
+from .replay import State
+from .saved import Functions, SavedValues
 
 
 class DenseBars(NamedTuple):
@@ -52,60 +32,26 @@ class DenseBars(NamedTuple):
         return bar
 
 
-class TimesBar(NamedTuple):
-    """With respect to the ends of the solve and to the times of `SaveAt(ts=...)`. The ends of all
-    other steps are what they are."""
-
-    t0: FloatScalar
-    t1: FloatScalar
-    ts: list[Float[Array, " times"] | None]
-
-
-class Step(NamedTuple):
-    """One recorded step, or several along leading axes."""
-
-    start: Float[Array, "*steps"]
-    end: Float[Array, "*steps"]
-    jumped: Bool[Array, "*steps"] | bool
-    accepted: Bool[Array, "*steps"]
-    state: Vectors  # from which it was made
-
-
-class Gradient(NamedTuple):
-    """With respect to the state behind accepted step `number`, to the leaves of the functions and
-    to times so far; `rows` are the last rows of each saving still to come."""
-
-    number: IntScalar
-    rows: list[IntScalar]
-    state: State
-    leaves: Any
-    times: TimesBar | None  # if they have derivatives
-
-
 class Backwards(eqx.Module):
     """Transposed steps of a recorded solve."""
 
-    leaves: Any  # of a `Replay`, with respect to which it is differentiated
-    rest: Any
+    functions: Functions
     record: Record
     first: State
     ends: Ends
-    rows: list[Rows]
+    saved: SavedValues
     dense: DenseBars
-
-    def _replay(self, leaves: Any) -> Replay:
-        return eqx.combine(leaves, self.rest)
 
     def run(self, last_bar: State, timed: bool) -> Gradient:
         """From the cotangent of the last state."""
         gradient = Gradient(
             self.ends.num_accepted,
-            [rows.count - 1 for rows in self.rows],
+            [rows.count - 1 for rows in self.saved.rows],
             last_bar,
-            jtu.tree_map(jnp.zeros_like, self.leaves),
+            jtu.tree_map(jnp.zeros_like, self.functions.leaves),
             self._no_times() if timed else None,
         )
-        gradient = self._through_end(gradient)
+        gradient = self.saved.through_end(gradient)
         total = unvmap_max(self.ends.num_steps)
 
         def through_segment(carry):
@@ -115,58 +61,13 @@ class Backwards(eqx.Module):
         sizes = self.record.sizes
         start = -(-total // (sizes.segment * sizes.block)), gradient
         _, gradient = lax.while_loop(lambda carry: carry[0] > 0, through_segment, start)
-        return self._through_start(gradient)
+        return self.saved.through_start(gradient, self.first.y)
 
     def _no_times(self) -> TimesBar:
         zero = jnp.zeros_like(self.ends.t0)
-        savings = self.rest.savings
+        savings = self.functions.rest.savings
         of = lambda saving: jnp.zeros(saving.num_times, zero.dtype) if saving.num_times else None
         return TimesBar(zero, zero, [of(saving) for saving in savings])
-
-    # The ends of a solve: rows that are functions of its first and last state alone.
-
-    def _through_end(self, gradient: Gradient) -> Gradient:
-        for k, saving in enumerate(self.rest.savings):
-            if saving.end:
-                unsaved = saving.steps == 0 or self.ends.num_accepted % saving.steps != 0
-                row = jnp.arange(len(self.rows[k].times))
-                used = (row == self.rows[k].count) & unsaved
-                gradient = self._through_copies(gradient, k, used, self.ends.last, self.ends.y)
-        return gradient
-
-    def _through_start(self, gradient: Gradient) -> Gradient:
-        """The row of `t0`; without any step (`t0 == t1`) those of `ts` are copies of it."""
-        for k, saving in enumerate(self.rest.savings):
-            if saving.offset or saving.num_times:
-                copies = jnp.where(self.ends.num_steps == 0, saving.num_times, 0)
-                used = jnp.arange(len(self.rows[k].times)) < saving.offset + copies
-                gradient = self._through_copies(gradient, k, used, self.ends.t0, self.first.y)
-        return gradient
-
-    def _through_copies(
-        self, gradient: Gradient, k: int, used: Bool[Array, " rows"], t: RealScalarLike, y: Y
-    ) -> Gradient:
-        """The rows of saving `k` that are the same function of one state."""
-        rows = self.rows[k]
-        bar = jtu.tree_map(lambda b: jnp.sum(_only(used, b), axis=0), rows.values_bar)
-        return self._through_value(gradient, k, t, y, bar, jnp.sum(_only(used, rows.times_bar)))
-
-    def _through_value(
-        self, gradient: Gradient, k: int, t: Any, y: Y, bar: Any, t_bar: FloatScalar
-    ) -> Gradient:
-        """What saving `k` saves of a state."""
-
-        def value(leaves: Any, y: Y, time: Any) -> Any:
-            saved = self._replay(leaves).savings[k].at_state(t if time is None else time, y)
-            return eqx.filter(saved, eqx.is_inexact_array)
-
-        _, pullback = jax.vjp(value, self.leaves, y, None if gradient.times is None else t)
-        leaves_bar, y_bar, more = pullback(bar)
-        state = gradient.state._replace(y=_add(gradient.state.y, y_bar))
-        gradient = gradient._replace(state=state, leaves=_add(gradient.leaves, leaves_bar))
-        return gradient if more is None else self._at_end_of_solve(gradient, t, t_bar + more)
-
-    # The steps between.
 
     def _steps_of_segment(self, i: IntScalar) -> Step:
         """Leading axes: blocks, steps."""
@@ -200,7 +101,7 @@ class Backwards(eqx.Module):
         def advance(x, step):
             step = eqx.combine(step, static)
             state = packing.unpack(x)
-            new, _ = self._replay(self.leaves).step(step.start, step.end, step.jumped, state)
+            new, _ = self.functions.replay.step(step.start, step.end, step.jumped, state)
             new = packing.pack(new)
             return {k: jnp.where(step.accepted, new[k], x[k]) for k in x}, x
 
@@ -243,117 +144,20 @@ class Backwards(eqx.Module):
         def value(leaves: Any, smooth: State, times: Any) -> tuple[State, Any]:
             start, end = (step.start, step.end) if times is None else times
             x = eqx.combine(smooth, discrete)
-            out = self._replay(leaves).step(start, end, step.jumped, x)
+            out = self.functions.at(leaves).step(start, end, step.jumped, x)
             return eqx.filter(out, eqx.is_inexact_array)
 
         times = None if gradient.times is None else (step.start, step.end)
-        (after, dense_info), pullback = jax.vjp(value, self.leaves, smooth, times)
+        (after, dense_info), pullback = jax.vjp(value, self.functions.leaves, smooth, times)
         new = gradient
-        for k in range(len(self.rest.savings)):
-            new = self._saved_behind(new, k, step, after.y)
+        for k in range(len(self.functions.rest.savings)):
+            new = self.saved.behind_step(new, k, step, after.y)
         zero = jtu.tree_map(jnp.zeros_like, dense_info)
         bar = self.dense.of(gradient.number, self.ends.num_accepted, zero)
-        for k in range(len(self.rest.savings)):
-            new, bar = self._saved_inside(new, k, step, dense_info, bar)
+        for k in range(len(self.functions.rest.savings)):
+            new, bar = self.saved.inside_step(new, k, step, dense_info, bar)
         leaves_bar, state_bar, times_bar = pullback((new.state, bar))
-        new = self._at_ends_of_step(new, step, times_bar)
-        leaves = _add(new.leaves, leaves_bar)
+        new = new.at_ends_of_step(self.ends, step, times_bar)
+        leaves = add(new.leaves, leaves_bar)
         new = new._replace(number=new.number - 1, state=state_bar, leaves=leaves)
         return jtu.tree_map(lambda a, b: jnp.where(step.accepted, a, b), new, gradient)
-
-    def _saved_behind(self, gradient: Gradient, k: int, step: Step, y: Y) -> Gradient:
-        """The row of the state behind a step, if it was saved."""
-        saving, rows, row = self.rest.savings[k], self.rows[k], gradient.rows[k]
-        if not saving.steps:
-            return gradient
-        saved = (gradient.number % saving.steps == 0) & (row >= saving.offset)
-        # The time that was saved is that behind a jump at which the step ended.
-        t = jnp.where(saved, rows.times[row], step.end)
-        bar = jtu.tree_map(lambda b: jnp.where(saved, b[row], 0), rows.values_bar)
-        gradient = self._through_value(
-            gradient, k, t, y, bar, jnp.where(saved, rows.times_bar[row], 0)
-        )
-        return gradient._replace(rows=_replaced(gradient.rows, k, row - jnp.where(saved, 1, 0)))
-
-    def _saved_inside(
-        self, gradient: Gradient, k: int, step: Step, dense_info: Any, bar: Any
-    ) -> tuple[Gradient, Any]:
-        """The rows interpolated in a step, and the cotangent of `dense_info`."""
-        saving, rows = self.rest.savings[k], self.rows[k]
-        if not saving.num_times:
-            return gradient, bar
-        first = gradient.number == 1
-
-        def is_inside(carry):
-            gradient, _ = carry
-            row = gradient.rows[k]
-            t = rows.times[row]
-            # A time at the start of a step is saved at the end of the one before, from which only
-            # a jump separates it.
-            inside = first | (t > step.start) | ((t == step.start) & step.jumped)
-            return step.accepted & (row >= saving.offset) & inside
-
-        def through_row(carry):
-            gradient, dense_bar = carry
-            row = gradient.rows[k]
-
-            def value(leaves: Any, dense_info: Any, times: Any) -> Any:
-                t, start, end = times or (rows.times[row], step.start, step.end)
-                saved = self._replay(leaves).savings[k].in_step(t, start, end, dense_info)
-                return eqx.filter(saved, eqx.is_inexact_array)
-
-            times = (rows.times[row], step.start, step.end)
-            times = None if gradient.times is None else times
-            bar = jtu.tree_map(lambda b: b[row], rows.values_bar)
-            leaves_bar, more, times_bar = jax.vjp(value, self.leaves, dense_info, times)[1](bar)
-            gradient = gradient._replace(
-                rows=_replaced(gradient.rows, k, row - 1), leaves=_add(gradient.leaves, leaves_bar)
-            )
-            if times_bar is not None:
-                t_bar, *times_bar = times_bar
-                t_bar = t_bar + rows.times_bar[row]
-                of_steps = (gradient.number - 1) // saving.steps if saving.steps else 0
-                i = row - saving.offset - of_steps
-                gradient = self._at_saved_time(gradient, k, i, t_bar)
-                gradient = self._at_ends_of_step(gradient, step, times_bar)
-            return gradient, _add(dense_bar, more)
-
-        return lax.while_loop(is_inside, through_row, (gradient, bar))
-
-    # Times, if they have derivatives.
-
-    def _at_ends_of_step(self, gradient: Gradient, step: Step, times_bar: Any) -> Gradient:
-        if times_bar is None:
-            return gradient
-        start_bar, end_bar = times_bar
-        bars, ends = gradient.times, self.ends
-        t0 = bars.t0 + jnp.where(step.start == ends.t0, start_bar, 0)
-        t1 = bars.t1 + jnp.where(step.end == ends.t1, end_bar, 0)
-        return gradient._replace(times=bars._replace(t0=t0, t1=t1))
-
-    def _at_end_of_solve(self, gradient: Gradient, t: Any, bar: FloatScalar) -> Gradient:
-        """A value saved at `t`, if that is one of the ends."""
-        bars, ends = gradient.times, self.ends
-        at_start = t == ends.t0
-        t0 = bars.t0 + jnp.where(at_start, bar, 0)
-        t1 = bars.t1 + jnp.where((t == ends.t1) & ~at_start, bar, 0)
-        return gradient._replace(times=bars._replace(t0=t0, t1=t1))
-
-    def _at_saved_time(
-        self, gradient: Gradient, k: int, i: IntScalar, bar: FloatScalar
-    ) -> Gradient:
-        ts = _replaced(gradient.times.ts, k, gradient.times.ts[k].at[i].add(bar))
-        return gradient._replace(times=gradient.times._replace(ts=ts))
-
-
-def _add(a: Any, b: Any) -> Any:
-    return jtu.tree_map(jnp.add, a, b)
-
-
-def _replaced(items: list, k: int, item: Any) -> list:
-    return [*items[:k], item, *items[k + 1 :]]
-
-
-def _only(used: Bool[Array, " rows"], x: Float[Array, "rows ..."]) -> Float[Array, "rows ..."]:
-    """The rows that are used, zeros for the others, whatever they hold."""
-    return jnp.where(used.reshape(used.shape + (1,) * (x.ndim - 1)), x, 0)

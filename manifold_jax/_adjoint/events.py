@@ -12,8 +12,8 @@ import optimistix as optx
 from diffrax import RESULTS
 from jaxtyping import Array, Bool, Float
 
-from .._compat import SaveState, time_direction, unvmap_any
-from .._custom_types import Args, BoolScalar, FloatScalar, IntScalar
+from .._compat import nonlinear_failure, SaveState, time_direction, unvmap_any, update_result
+from .._custom_types import Args, BoolScalar, FloatScalar, IntScalar, Y
 from .._solver.base import AbstractManifoldSolver
 
 
@@ -78,15 +78,23 @@ class _LastStep:
         times, results = jax.vmap(self._root)(jnp.arange(len(self.events)), changed)
         order = jnp.where(changed, lax.stop_gradient(times), jnp.inf)
         i = jnp.argmin(order)
-        result = jtu.tree_map(lambda x: x[i], results)
-        return times[i], jnp.arange(len(self.events)) == i, RESULTS.promote(result)
+        result = RESULTS.promote(jtu.tree_map(lambda x: x[i], results))
+        _, success = self._state(times[i])
+        result = update_result(result, RESULTS.where(success, result, nonlinear_failure()))
+        return times[i], jnp.arange(len(self.events)) == i, result
+
+    def _state(self, t: FloatScalar) -> tuple[Y, BoolScalar | bool]:
+        """On the manifold, and whether it could be moved there."""
+        solver, y = self.given["solver"], self.interpolation.evaluate(t)
+        if not (isinstance(solver, AbstractManifoldSolver) and solver.corrects_output):
+            return y, True
+        time = t * time_direction(self.given["terms"])
+        y, info = solver.projection(solver.constraint, time, y, self.args)
+        return y, info.success
 
     def _values(self, t: FloatScalar) -> Float[Array, " events"]:
         """Of a condition that is true or false: how long it is until the end of the step."""
-        solver, y = self.given["solver"], self.interpolation.evaluate(t)
-        if isinstance(solver, AbstractManifoldSolver) and solver.corrects_output:
-            time = t * time_direction(self.given["terms"])
-            y, _ = solver.projection(solver.constraint, time, y, self.args)
+        y, _ = self._state(t)
 
         def value(event, after):
             if after.dtype == bool:
@@ -116,9 +124,7 @@ class _LastStep:
             return jnp.where(changed, there, self.end - t)
 
         options = dict(lower=self.start, upper=self.end)
-        root = optx.root_find(
-            value, self.root_finder, self.end, options=options, throw=False
-        )
+        root = optx.root_find(value, self.root_finder, self.end, options=options, throw=False)
         return root.value, root.result
 
 
@@ -172,5 +178,7 @@ def _saved_until(
         saveat_ts_index=jnp.asarray(num_times, jnp.result_type(state.saveat_ts_index)),
         ts=rows(state.ts, t, empty[0]),
         ys=jtu.tree_map(lambda old, new: rows(old, new, empty[1]), state.ys, value),
-        save_index=jnp.asarray(count + ends, jnp.result_type(state.save_index)),
+        save_index=jnp.asarray(
+            jnp.where(ends, count + 1, count), jnp.result_type(state.save_index)
+        ),
     )

@@ -1,8 +1,7 @@
 """What a solve leaves behind for its way back: when each step was made, and from which state."""
 
-import math
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -13,13 +12,10 @@ from jaxtyping import Array, Float
 
 from .._compat import buffer_at_set, MaybeBuffer, unvmap_max, while_loop
 from .._custom_types import IntScalar
+from .sizes import Sizes
 
 
 Vectors = dict[str, Any]  # of each type of number one, also buffers of such
-
-# States that are all kept: as many as fit into this, and not more than a batch has use for, as
-# memory that is not in a cache takes longer to fill than a small state to compute again.
-_BYTES, _STATES = 2**20, 512
 
 
 class Packing(eqx.Module):
@@ -89,7 +85,7 @@ class Record(eqx.Module):
     states: Vectors  # (kept blocks, block, n)
     firsts: Vectors  # (segments, n); none if all states are kept
     packing: Packing = eqx.field(static=True)
-    sizes: "Sizes" = eqx.field(static=True)
+    sizes: Sizes = eqx.field(static=True)
 
     @staticmethod
     def empty(
@@ -128,33 +124,6 @@ class Record(eqx.Module):
         states = {k: keep(b, block.states[k]) for k, b in self.states.items()}
         times = buffer_at_set(self.times, i, block.times)
         return Record(times, states, firsts, self.packing, sizes)
-
-
-# A block whose arrays are small, as XLA for CPUs sees them.
-_SMALL, _FEWEST = 512, 8
-# States that are all kept: as many as fit into this, and not more than a batch has use for, as
-# memory that is not in a cache takes longer to fill than a small state to compute again.
-_BYTES, _STATES = 2**20, 512
-
-
-class Sizes(NamedTuple):
-    """Steps of a block, blocks of a segment, all blocks, and those of which all states are kept."""
-
-    block: int
-    segment: int
-    blocks: int
-    kept: int
-
-    @staticmethod
-    def of(nbytes: int, max_steps: int, checkpoints: int | None) -> "Sizes":
-        steps = max(math.isqrt(max_steps), -(-max_steps // (checkpoints or max_steps)))
-        block = min(_FEWEST, steps) if nbytes * _FEWEST <= _SMALL else steps
-        segment = -(-steps // block)
-        segments = -(-max_steps // (segment * block))
-        if checkpoints is None:
-            checkpoints = segments + min(_STATES, _BYTES // max(nbytes, 1))
-        kept = segments if checkpoints >= max_steps else (checkpoints - segments) // (segment * block)
-        return Sizes(block, segment, segments * segment, min(kept, segments) * segment)
 
 
 def recording(record: Record, of: Callable[[Any], Any], run: Callable) -> tuple[Any, Record]:

@@ -12,7 +12,7 @@ import jax.tree_util as jtu
 from jaxtyping import Array
 
 from .._custom_types import Args, RealScalarLike, Y
-from .._projection import ProjectionInfo
+from .._projection_info import ProjectionInfo
 from .._solver.advance import HookState
 from .._solver.explicit import explicit_step, is_unrollable
 

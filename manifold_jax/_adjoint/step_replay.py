@@ -1,6 +1,6 @@
 """Reverse mode that goes back through the recorded steps, each computed once more."""
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import diffrax as dfx
 import equinox as eqx
@@ -14,50 +14,51 @@ from .._compat import (
     save_states,
     while_loop,
 )
-from .backwards import Backwards, DenseBars, Ends, Rows, TimesBar
+from .backwards import Backwards, DenseBars
+from .gradient import Ends, TimesBar
+from .handed_out import HandedOut
 from .record import Record, recording
-from .replay import memory_of, Replay, Solve, State, with_memory
+from .replay import Replay, Solve
+from .saved import Functions, Rows, SavedValues
 
 
 class StepReplayAdjoint(dfx.AbstractAdjoint):
-    r"""Reverse mode for small systems, `adjoint=mj.StepReplayAdjoint()`.
+    r"""The derivative of the discrete solution in reverse mode; the default of
+    [`diffeqsolve`][].
 
-    The derivative of the discrete solution, as with `diffrax.RecursiveCheckpointAdjoint`:
-    from the accepted steps $y_{i+1} = \Phi(t_i, t_{i+1}, y_i, \theta)$ and the gradient
+    From the accepted steps $y_{i+1} = \Phi(t_i, t_{i+1}, y_i, \theta)$ and the gradient
     $\bar y_n$ with respect to the last state
 
     $$\bar y_i = (\partial\Phi/\partial y_i)^T \bar y_{i+1} + (\partial s_i/\partial y_i)^T \bar s_i, \qquad
       \bar\theta = \sum_i (\partial\Phi/\partial\theta)^T \bar y_{i+1} + \dots$$
 
-    with $s_i$ what was saved in step $i$. The solve records $(t_i, t_{i+1}, y_i)$, and the way
-    back computes each step once more, where recursive checkpointing repeats large parts of
-    the solve, controller and saving included. The step sizes are those that were recorded:
-    rounding differently on the way back cannot change them.
+    with $s_i$ what was saved in step $i$, events and the dense solution included. The solve
+    records $(t_i, t_{i+1})$ and some $y_i$, and the way back computes each step once more, of the
+    size that was recorded. `diffrax.RecursiveCheckpointAdjoint` repeats parts of the solve with its
+    controller instead: rounded differently, repeated steps get other sizes, and its gradient is
+    that of another solution. At tight tolerances it is less accurate than the solve, and with
+    additive methods (`KenCarp3` and a `MultiTerm`) it can be plainly wrong.
+
+    Derivatives are those with respect to `y0`, `args`, all that terms, constraints and `fn` hold or
+    close over, `t0`, `t1` and `SaveAt(ts=...)`. Under `vmap` all trajectories go back with one
+    common counter.
 
     **Arguments:**
 
-    - `checkpoints`: the largest number of states to record, by default all of them if a
-        state has up to 64 bytes, and about `sqrt(max_steps)` otherwise. Every
-        `ceil(max_steps / checkpoints)`-th state is kept, and those between two of them are
-        computed again, one more pass over the steps altogether. Fewer save memory, and time in
-        a batch where `max_steps` is much more than the number of steps. Memory: `3 max_steps`
-        numbers, `checkpoints` states, and the states between two of them.
-
-    Works with any one-step solver of Diffrax or this library, adaptive or constant steps, and
-    `SaveAt` with `t0`, `t1`, `ts`, `steps` and `fn`. Derivatives with respect to `y0`,
-    `args`, and all that terms, constraints and `fn` hold or close over. Under `vmap` all
-    trajectories go back with one common counter.
+    - `checkpoints`: the largest number of states to record. By default those of the first 512
+        steps, or as many as fit into 1 MiB, and about `sqrt(max_steps)` of the others; the states
+        between two of these are computed again, once, about `sqrt(max_steps)` at a time.
+        `checkpoints=max_steps` records every state. Memory, besides these states: three numbers
+        for each of `max_steps`.
 
     **Raises:**
 
-    `ValueError` for what it does not support: events, `max_steps=None`, `UnsafeBrownianPath`,
-    solvers with a memory (`LeapfrogMidpoint`, `ReversibleHeun`; your own cannot be told), `ts`
-    and `steps` in one `SubSaveAt`. An error when differentiating with respect to times
-    (`t0`, `t1`, `dt0`, `ts`) or through the dense solution. Use
-    `diffrax.RecursiveCheckpointAdjoint()` there, which is also the better choice where a
-    state is so large that `max_steps` of them do not fit into memory, and under `vmap` with
-    thousands of parameters in common (neural networks: each trajectory sums up a gradient
-    of its own); for few parameters and many outputs use `diffrax.ForwardMode()`.
+    `ValueError` for an `UnsafeBrownianPath`, and when differentiating with `max_steps=None`, as
+    there is no room for the record; `RuntimeError` when differentiating with respect to `dt0`,
+    which a solution depends on by its error alone. It cannot be differentiated forwards (its gradient can,
+    for Hessian-vector products): for that, and for few parameters and many outputs, use
+    `diffrax.ForwardMode()`. With thousands of parameters in common under `vmap` (neural networks)
+    each trajectory sums up a gradient of its own.
 
     Source: Griewank & Walther, Evaluating Derivatives (2008), ch. 12, without recursion.
     """
@@ -165,43 +166,6 @@ def _no_derivative(primals, tangents):
     return tree, jtu.tree_map(lambda leaf: None, tree)
 
 
-class HandedOut(NamedTuple):
-    """What has derivatives of the final state of a loop: not its statistics, and not the state of
-    the step size controller."""
-
-    ts: list[Any]
-    ys: list[Any]
-    dense_ts: Any
-    dense_infos: Any
-    event_dense_info: Any
-    state: State
-
-    @staticmethod
-    def of(final_state: Any, remembers: bool) -> "HandedOut":
-        saved = save_states(final_state)
-        memory = memory_of(final_state.solver_state) if remembers else None
-        return HandedOut(
-            [s.ts for s in saved],
-            [s.ys for s in saved],
-            final_state.dense_ts,
-            final_state.dense_infos,
-            final_state.event_dense_info,
-            State(final_state.y, memory),
-        )
-
-    def put_into(self, final_state: Any) -> Any:
-        put = lambda s, *new: eqx.tree_at(lambda s: (s.ts, s.ys), s, new, is_leaf=_is_none)
-        saved = zip(save_states(final_state), self.ts, self.ys, strict=True)
-        final_state = eqx.tree_at(save_states, final_state, [put(*of) for of in saved])
-        parts = lambda s: (s.dense_ts, s.dense_infos, s.event_dense_info, s.y)
-        new = self.dense_ts, self.dense_infos, self.event_dense_info, self.state.y
-        final_state = eqx.tree_at(parts, final_state, new, is_leaf=_is_none)
-        if self.state.memory is None:
-            return final_state
-        solver_state = with_memory(final_state.solver_state, self.state.memory)
-        return eqx.tree_at(lambda s: s.solver_state, final_state, solver_state, is_leaf=_is_none)
-
-
 @eqx.filter_custom_vjp
 def _solve(differentiable, record, remembers):
     *_, forward = differentiable
@@ -244,14 +208,13 @@ def _backward(residuals, cotangents, perturbed, differentiable, record, remember
         if saving.steps:
             count += ends.num_accepted // saving.steps
         rows.append(Rows(times, count, ts_bar, ys_bar))
-    leaves, rest = eqx.partition(replay, perturbed[0])
+    functions = Functions(*eqx.partition(replay, perturbed[0]))
     back = Backwards(
-        leaves,
-        rest,
+        functions,
         record,
         start,
         ends,
-        rows,
+        SavedValues(functions, ends, rows),
         DenseBars(
             None if dense[0] is None else bar.dense_infos,
             None if dense[1] is None else bar.event_dense_info,
@@ -270,12 +233,8 @@ def _with_loops(solver: Any, kind: str) -> Any:
     forwards of the one backwards, unless it is told otherwise (as its own adjoints do)."""
     if getattr(solver, "scan_kind", "none") is not None:
         return solver
-    return eqx.tree_at(lambda s: s.scan_kind, solver, kind, is_leaf=_is_none)
+    return eqx.tree_at(lambda s: s.scan_kind, solver, kind, is_leaf=lambda x: x is None)
 
 
 def _subs(saveat: dfx.SaveAt) -> list[dfx.SubSaveAt]:
     return jtu.tree_leaves(saveat.subs, is_leaf=lambda x: isinstance(x, dfx.SubSaveAt))
-
-
-def _is_none(x: Any) -> bool:
-    return x is None

@@ -1,0 +1,159 @@
+"""The way back through saved values: to the states, steps and times that they are functions of."""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.lax as lax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jaxtyping import Array, Bool, Float
+
+from .._custom_types import FloatScalar, IntScalar, RealScalarLike, Y
+from .gradient import add, Ends, Gradient, replaced, Step
+from .replay import Replay
+
+
+class Functions(eqx.Module):
+    """A [`Replay`][] in two parts: what has derivatives, and the rest."""
+
+    leaves: Any
+    rest: Any
+
+    @property
+    def replay(self) -> Replay:
+        return self.at(self.leaves)
+
+    def at(self, leaves: Any) -> Replay:
+        return eqx.combine(leaves, self.rest)
+
+
+class Rows(NamedTuple):
+    """What one of the savings has saved: times, how many rows come before that of the end, and
+    the cotangents of times and values."""
+
+    times: Float[Array, " rows"]
+    count: IntScalar
+    times_bar: Float[Array, " rows"]
+    values_bar: Any  # leading axis: rows
+
+
+class SavedValues(eqx.Module):
+    """The rows of all savings."""
+
+    functions: Functions
+    ends: Ends
+    rows: list[Rows]
+
+    @property
+    def _savings(self) -> Any:
+        return self.functions.rest.savings
+
+    def through_end(self, gradient: Gradient) -> Gradient:
+        for k, saving in enumerate(self._savings):
+            if saving.end:
+                unsaved = saving.steps == 0 or self.ends.num_accepted % saving.steps != 0
+                row = jnp.arange(len(self.rows[k].times))
+                used = (row == self.rows[k].count) & unsaved
+                gradient = self._through_copies(gradient, k, used, self.ends.last, self.ends.y)
+        return gradient
+
+    def through_start(self, gradient: Gradient, first: Y) -> Gradient:
+        """The row of `t0`; without any step (`t0 == t1`) those of `ts` are copies of it."""
+        for k, saving in enumerate(self._savings):
+            if saving.offset or saving.num_times:
+                copies = jnp.where(self.ends.num_steps == 0, saving.num_times, 0)
+                used = jnp.arange(len(self.rows[k].times)) < saving.offset + copies
+                gradient = self._through_copies(gradient, k, used, self.ends.t0, first)
+        return gradient
+
+    def _through_copies(
+        self, gradient: Gradient, k: int, used: Bool[Array, " rows"], t: RealScalarLike, y: Y
+    ) -> Gradient:
+        """The rows of saving `k` that are the same function of one state."""
+        rows = self.rows[k]
+        bar = jtu.tree_map(lambda b: jnp.sum(_only(used, b), axis=0), rows.values_bar)
+        return self._through_value(gradient, k, t, y, bar, jnp.sum(_only(used, rows.times_bar)))
+
+    def _through_value(
+        self, gradient: Gradient, k: int, t: Any, y: Y, bar: Any, t_bar: FloatScalar
+    ) -> Gradient:
+        """What saving `k` saves of a state."""
+
+        def value(leaves: Any, y: Y, time: Any) -> Any:
+            saved = self.functions.at(leaves).savings[k].at_state(t if time is None else time, y)
+            return eqx.filter(saved, eqx.is_inexact_array)
+
+        _, pullback = jax.vjp(
+            value, self.functions.leaves, y, None if gradient.times is None else t
+        )
+        leaves_bar, y_bar, more = pullback(bar)
+        state = gradient.state._replace(y=add(gradient.state.y, y_bar))
+        gradient = gradient._replace(state=state, leaves=add(gradient.leaves, leaves_bar))
+        return gradient if more is None else gradient.at_end_of_solve(self.ends, t, t_bar + more)
+
+    def behind_step(self, gradient: Gradient, k: int, step: Step, y: Y) -> Gradient:
+        """The row of the state behind a step, if it was saved."""
+        saving, rows, row = self._savings[k], self.rows[k], gradient.rows[k]
+        if not saving.steps:
+            return gradient
+        saved = (gradient.number % saving.steps == 0) & (row >= saving.offset)
+        # The time that was saved is that behind a jump at which the step ended.
+        t = jnp.where(saved, rows.times[row], step.end)
+        bar = jtu.tree_map(lambda b: jnp.where(saved, b[row], 0), rows.values_bar)
+        gradient = self._through_value(
+            gradient, k, t, y, bar, jnp.where(saved, rows.times_bar[row], 0)
+        )
+        return gradient._replace(rows=replaced(gradient.rows, k, row - jnp.where(saved, 1, 0)))
+
+    def inside_step(
+        self, gradient: Gradient, k: int, step: Step, dense_info: Any, bar: Any
+    ) -> tuple[Gradient, Any]:
+        """The rows interpolated in a step, and the cotangent of `dense_info`."""
+        saving, rows = self._savings[k], self.rows[k]
+        if not saving.num_times:
+            return gradient, bar
+        first = gradient.number == 1
+
+        def is_inside(carry):
+            gradient, _ = carry
+            row = gradient.rows[k]
+            t = rows.times[row]
+            # A time at the start of a step is saved at the end of the one before, from which only
+            # a jump separates it.
+            inside = first | (t > step.start) | ((t == step.start) & step.jumped)
+            return step.accepted & (row >= saving.offset) & inside
+
+        def through_row(carry):
+            gradient, dense_bar = carry
+            row = gradient.rows[k]
+
+            def value(leaves: Any, dense_info: Any, times: Any) -> Any:
+                t, start, end = times or (rows.times[row], step.start, step.end)
+                saved = self.functions.at(leaves).savings[k].in_step(t, start, end, dense_info)
+                return eqx.filter(saved, eqx.is_inexact_array)
+
+            times = (rows.times[row], step.start, step.end)
+            times = None if gradient.times is None else times
+            bar = jtu.tree_map(lambda b: b[row], rows.values_bar)
+            leaves_bar, more, times_bar = jax.vjp(value, self.functions.leaves, dense_info, times)[
+                1
+            ](bar)
+            gradient = gradient._replace(
+                rows=replaced(gradient.rows, k, row - 1), leaves=add(gradient.leaves, leaves_bar)
+            )
+            if times_bar is not None:
+                t_bar, *times_bar = times_bar
+                t_bar = t_bar + rows.times_bar[row]
+                of_steps = (gradient.number - 1) // saving.steps if saving.steps else 0
+                i = row - saving.offset - of_steps
+                gradient = gradient.at_saved_time(k, i, t_bar)
+                gradient = gradient.at_ends_of_step(self.ends, step, times_bar)
+            return gradient, add(dense_bar, more)
+
+        return lax.while_loop(is_inside, through_row, (gradient, bar))
+
+
+def _only(used: Bool[Array, " rows"], x: Float[Array, "rows ..."]) -> Float[Array, "rows ..."]:
+    """The rows that are used, zeros for the others, whatever they hold."""
+    return jnp.where(used.reshape(used.shape + (1,) * (x.ndim - 1)), x, 0)
