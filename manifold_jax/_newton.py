@@ -105,10 +105,14 @@ def _chord(
     max_steps: int,
 ) -> _Iterate:
     """Simplified Newton: one factorization throughout. Two iterations are nearly always
-    enough, and are written out so that they fuse with the step around them."""
+    enough, and are written out so that they fuse with the step around them.
+
+    A point that is on the manifold to rounding stays where it is: a correction of that size is
+    large for a component that is small."""
     z, level = jnp.zeros_like(r), equations.level(r)
+    needed = level > _ROUNDING * jnp.finfo(r.dtype).eps
     for _ in range(min(2, max_steps)):
-        z = z - factorization.solve(r)
+        z = jnp.where(needed, z - factorization.solve(r), z)
         r, level = equations.at(z)
     return jax.lax.while_loop(
         lambda s: (
