@@ -120,3 +120,26 @@ def test_no_room_for_steps():
     options = dict(adjoint=adjoint, max_steps=0, throw=False)
     end = lambda y0: dfx.diffeqsolve(DECAY, dfx.Heun(), 0.0, 1.0, 0.1, y0, RATE, **options).ys[0, 0]
     assert jax.grad(end)(Y0) == 1
+
+
+def test_none_in_the_state_and_in_what_is_saved():
+    circle = mj.Constraint(lambda t, y, args: y["a"] @ y["a"] - 1)
+
+    def field(t, y, args):
+        return {"a": args * jnp.stack([-y["a"][1], y["a"][0]]), "b": None}
+
+    def objective(rate):
+        sol = mj.diffeqsolve(
+            dfx.ODETerm(field),
+            mj.Projected(dfx.Dopri8(), circle),
+            0.0,
+            1.0,
+            0.1,
+            {"a": jnp.array([1.0, 0.0]), "b": None},
+            rate,
+            saveat=dfx.SaveAt(ts=jnp.array([0.3, 0.7]), fn=lambda t, y, args: (y["a"][0], None)),
+        )
+        return jnp.sum(sol.ys[0])
+
+    expected = -0.3 * np.sin(0.3) - 0.7 * np.sin(0.7)
+    np.testing.assert_allclose(jax.jit(jax.grad(objective))(1.0), expected, rtol=1e-8)
