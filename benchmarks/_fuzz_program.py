@@ -9,6 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 
+import manifold_jax as mj
+
 from ._fuzz_problem import pack_state, Problem, unpack
 from ._fuzz_structure import Structure
 
@@ -51,7 +53,7 @@ def solve(structure: Structure, adjoint: Any = None, throw: bool = False) -> Cal
             stepsize_controller=controller,
             event=event,
             max_steps=MAX_STEPS if structure.is_adaptive else structure.steps + 2,
-            adjoint=dfx.RecursiveCheckpointAdjoint() if adjoint is None else adjoint,
+            adjoint=mj.StepReplayAdjoint() if adjoint is None else adjoint,
             throw=throw,
         )
         times, states = handed_out(sol)

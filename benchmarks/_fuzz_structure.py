@@ -23,7 +23,7 @@ STABILIZED = ("invariant", "invariant-projected", "exact")
 OF_MECHANICS = ("baumgarte", "velocity")
 LAYOUTS = ("vector", "scalars", "nested", "matrix", "with-none")
 FAILURES = ("none", "nan-field", "nan-start", "impossible", "dependent", "fast")
-REVERSE = ("default", "replay", "direct")
+REVERSE = ("default", "few states", "direct")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -110,8 +110,6 @@ def structure(index: int, seed: int) -> Structure:
     outputs = OUTPUTS[:-1] if family.stiff else OUTPUTS
     output = choose(("t1", "steps") if approach == "steps-only" else outputs)
     reverse = choose(REVERSE[:2] if chance(0.9) else REVERSE) if chance(0.35) else None
-    if output in ("dense", "event") and reverse == "replay":
-        reverse = "default"
     return Structure(
         index=index,
         seed=seed,

@@ -416,12 +416,6 @@ def test_dense_solution_and_solver_state():
     np.testing.assert_allclose(reverse, forward, rtol=1e-12)
 
 
-def test_forward_mode_is_refused():
-    case = (mj.Projected, SAVEATS["t1"], dfx.Tsit5())
-    with pytest.raises(TypeError, match="custom_vjp"):
-        jax.jacfwd(lambda theta: loss(theta, mj.StepReplayAdjoint(), *case))(THETA)
-
-
 def test_steps_across_jumps_of_the_field():
     """The state after a jump starts a new step just behind it."""
 

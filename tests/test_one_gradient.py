@@ -101,6 +101,7 @@ def test_one_gradient_of_all_steps():
     check("projected", "Tsit5", dfx.SaveAt(t0=True, steps=True), 1.5, (1e-6,), rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_one_gradient_of_the_dense_solution():
     check("projected", "Tsit5", dfx.SaveAt(dense=True), 1.5, (1e-10,), dense=True)
 
