@@ -50,27 +50,6 @@ class Packing(eqx.Module):
         return sum(like.size * like.dtype.itemsize for like in self.leaves)
 
 
-class Block(eqx.Module):
-    """Steps one after the other. Small ones are recorded in a loop of their own: XLA for CPUs runs
-    the operations of a loop one after the other if all its arrays are small, and hands them to
-    threads if not, which may take longer than a step."""
-
-    # Columns: start, end, and 1 behind a jump if there may be jumps. The end of a rejected step
-    # and of an unused row is minus infinity.
-    times: MaybeBuffer[Float[Array, "block columns"]]
-    states: Vectors  # from which they were made; none if they are not kept
-
-    @staticmethod
-    def empty(x: Vectors, time_dtype: Any, length: int, jumps: bool, kept: bool) -> "Block":
-        times = jnp.full((length, 3 if jumps else 2), -jnp.inf, time_dtype)
-        room = lambda x: jnp.zeros((length, x.size), x.dtype)
-        return Block(times, {k: room(v) for k, v in x.items()} if kept else {})
-
-    def including(self, i: IntScalar, row: Float[Array, " columns"], x: Vectors) -> "Block":
-        states = {k: buffer_at_set(b, i, x[k]) for k, b in self.states.items()}
-        return Block(buffer_at_set(self.times, i, row), states)
-
-
 class Record(eqx.Module):
     """The steps of a solve, rejected ones included, in blocks: when each was made, and the states
     from which they were made: all of the first few, of later ones the first of each segment,
@@ -93,70 +72,57 @@ class Record(eqx.Module):
     ) -> "Record":
         packing = Packing.of(state)
         sizes = Sizes.of(packing.nbytes, max_steps, checkpoints)
-        x = {k: jnp.zeros_like(v) for k, v in packing.pack(state).items()}
-        one = Block.empty(x, time_dtype, sizes.block, jumps, sizes.kept > 0)
-        repeat = lambda rows, x: jnp.broadcast_to(x, (rows, *x.shape))
+        x = packing.pack(state)
+        room = lambda rows, v: jnp.zeros((*rows, v.size), v.dtype)
         segments = 0 if sizes.kept == sizes.blocks else sizes.blocks // sizes.segment
-        return Record(
-            repeat(sizes.blocks, one.times),
-            {k: repeat(sizes.kept, v) for k, v in one.states.items()},
-            {k: repeat(segments, v) for k, v in x.items() if segments},
-            packing,
-            sizes,
-        )
+        kept = {k: room((sizes.kept, sizes.block), v) for k, v in x.items() if sizes.kept}
+        times = jnp.full((sizes.blocks, sizes.block, 3 if jumps else 2), -jnp.inf, time_dtype)
+        firsts = {k: room((segments,), v) for k, v in x.items() if segments}
+        return Record(times, kept, firsts, packing, sizes)
 
     @property
     def jumps(self) -> bool:
         return self.times.shape[2] == 3
 
-    def new_block(self, x: Vectors) -> Block:
-        kept = self.sizes.kept > 0
-        return Block.empty(x, self.times.dtype, self.sizes.block, self.jumps, kept)
-
-    def including(self, i: IntScalar, block: Block, first: Vectors) -> "Record":
-        """With the block number `i`, whose first step was made from `first`."""
-        sizes, last = self.sizes, self.sizes.kept - 1
-        segment, begins = i // sizes.segment, i % sizes.segment == 0
-        firsts = {
-            k: buffer_at_set(b, segment, first[k], pred=begins) for k, b in self.firsts.items()
-        }
-        keep = lambda b, x: buffer_at_set(b, jnp.minimum(i, last), x, pred=i <= last)
-        states = {k: keep(b, block.states[k]) for k, b in self.states.items()}
-        times = buffer_at_set(self.times, i, block.times)
+    def including(self, i: IntScalar, row: Float[Array, " columns"], x: Vectors) -> "Record":
+        """With step number `i`, made from `x`."""
+        sizes = self.sizes
+        block, within = i // sizes.block, i % sizes.block
+        segment, begins = block // sizes.segment, (block % sizes.segment == 0) & (within == 0)
+        firsts = {k: buffer_at_set(b, segment, x[k], pred=begins) for k, b in self.firsts.items()}
+        at = jnp.minimum(block, sizes.kept - 1), within
+        is_kept = block < sizes.kept
+        states = {k: buffer_at_set(b, at, x[k], pred=is_kept) for k, b in self.states.items()}
+        times = buffer_at_set(self.times, (block, within), row)
         return Record(times, states, firsts, self.packing, sizes)
 
 
 def recording(record: Record, of: Callable[[Any], Any], run: Callable) -> tuple[Any, Record]:
     """`run(while_loop)` with `while_loop` as Diffrax's outer loop, and what it recorded of
     the states `of(loop state)`."""
-    written, block = record, record.sizes.block
-    flat = lambda state: record.packing.pack(of(state))
+    written = record
 
     def loop(cond_fun, body_fun, init_val, *, max_steps, buffers):
         nonlocal written
 
         def step(carry):
-            state, recent = carry
+            state, record = carry
             new = body_fun(state)
             accepted = new.num_accepted_steps > state.num_accepted_steps
             row = [state.tprev, jnp.where(accepted, state.tnext, -jnp.inf)]
             if record.jumps:
                 row.append(jnp.asarray(state.made_jump, state.tprev.dtype))
-            i = unvmap_max(state.num_steps) % block
-            return new, recent.including(i, jnp.stack(row), flat(state))
+            x = record.packing.pack(of(state))
+            return new, record.including(unvmap_max(state.num_steps), jnp.stack(row), x)
 
-        def through_block(carry):
-            state, record = carry
-            i, first = unvmap_max(state.num_steps) // block, flat(state)
-            state, recent = nested(step, (state, record.new_block(first)), block)
-            return state, record.including(i, recent, first)
-
-        def nested(body, carry, most):
-            both = lambda carry: buffers(carry[0]) + jtu.tree_leaves(carry[1])
-            goes_on = lambda carry: cond_fun(carry[0]) & (carry[0].num_steps < max_steps)
-            return while_loop(goes_on, body, carry, max_steps=most, buffers=both, kind="lax")
-
-        final, written = nested(through_block, (init_val, record), record.sizes.blocks)
+        final, written = while_loop(
+            lambda carry: cond_fun(carry[0]),
+            step,
+            (init_val, record),
+            max_steps=max_steps,
+            buffers=lambda carry: buffers(carry[0]) + jtu.tree_leaves(carry[1]),
+            kind="lax",
+        )
         return final
 
     out = run(loop)
