@@ -8,6 +8,7 @@ import outside
 import pytest
 import scipy.linalg
 import scipy.optimize
+from optimized import optimized_jit
 
 import manifold_jax as mj
 
@@ -269,3 +270,44 @@ def test_charts_need_independent_equations():
             0.1,
             jnp.asarray(unit_start()),
         )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("chart", ["tangent", "partition", None])
+def test_stages_do_not_amplify_rounding(chart):
+    """With given steps rounding stays rounding, in charts as without (`None`).
+
+    With adaptive steps it does not: after a step whose error estimate is near rounding the next
+    step size depends on it, so that ends differ by a part of the tolerance, also in plain Diffrax.
+    """
+    rng = np.random.default_rng(5)
+    A, d = jnp.asarray(rng.normal(size=(50, 4, 4))), jnp.asarray(rng.normal(size=(50, 4)))
+    q, y0 = jnp.asarray(rng.uniform(0.5, 2.0, (50, 4))), rng.normal(size=(50, 4))
+    y0 = jnp.asarray(y0 / np.sqrt(np.sum(q * y0**2, axis=1))[:, None])
+
+    def end(A, d, q, y0):
+        def field(t, y, args):
+            f, G = A @ y + jnp.cos(t) * d, q * y
+            return f - G * (G @ f) / (G @ G)
+
+        constraint = mj.Constraint(lambda t, y, args: (y @ (q * y) - 1) / 2)
+        solver = dfx.Dopri8()
+        if chart is not None:
+            solver = mj.LocalCoordinates(solver, constraint, chart=CHARTS[chart])
+        sol = mj.diffeqsolve(
+            dfx.ODETerm(field),
+            solver,
+            0.0,
+            1.5,
+            None,
+            y0,
+            stepsize_controller=dfx.StepTo(jnp.linspace(0.0, 1.5, 25)),
+            throw=False,
+        )
+        return sol.ys[0]
+
+    end = optimized_jit(jax.vmap(end))
+    change = 1e-15 * jnp.array([[1.0, -1.0, 2.0, 1.0]])
+    ends, moved = end(A, d, q, y0), end(A, d, q, y0 * (1 + change))
+    assert jnp.all(jnp.isfinite(ends))
+    np.testing.assert_allclose(moved, ends, rtol=0, atol=1e-12)

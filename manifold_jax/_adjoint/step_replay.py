@@ -53,9 +53,9 @@ class StepReplayAdjoint(dfx.AbstractAdjoint):
 
     **Raises:**
 
-    `ValueError` for an `UnsafeBrownianPath`, and when differentiating with `max_steps=None`, as
-    there is no room for the record; `RuntimeError` when differentiating with respect to `dt0`,
-    which a solution depends on by its error alone. It cannot be differentiated forwards (its gradient can,
+    `ValueError` for an `UnsafeBrownianPath`. `RuntimeError` when differentiating with
+    `max_steps=None`, as there is no room for the record, or with respect to `dt0`, on which a
+    solution depends by its error alone. It cannot be differentiated forwards (its gradient can,
     for Hessian-vector products): for that, and for few parameters and many outputs, use
     `diffrax.ForwardMode()`. With thousands of parameters in common under `vmap` (neural networks)
     each trajectory sums up a gradient of its own.
@@ -191,33 +191,23 @@ def _backward(residuals, cotangents, perturbed, differentiable, record, remember
         raise RuntimeError(_UNBOUNDED)
     record, last, counts, handed_out = residuals
     replay, start, (t0, t1, ts), forward = differentiable
-    _, bar = cotangents
-    none_if_zero = lambda tree: tree if jtu.tree_leaves(tree) else None
-    dense = none_if_zero(bar.dense_infos), none_if_zero(bar.event_dense_info)
+    _, given = cotangents
     bar = jtu.tree_map(
         lambda x, b: jnp.zeros_like(x) if b is None else b,
         eqx.filter(handed_out, eqx.is_inexact_array),
-        bar,
+        given,
     )
     ends = Ends(t0, t1, *last)
-    rows = []
-    for saving, (times, count), ts_bar, ys_bar in zip(
-        replay.savings, counts, bar.ts, bar.ys, strict=True
-    ):
-        count = saving.offset + count
-        if saving.steps:
-            count += ends.num_accepted // saving.steps
-        rows.append(Rows(times, count, ts_bar, ys_bar))
     functions = Functions(*eqx.partition(replay, perturbed[0]))
     back = Backwards(
         functions,
         record,
         start,
         ends,
-        SavedValues(functions, ends, rows),
+        SavedValues(functions, ends, _rows(replay, counts, bar, ends)),
         DenseBars(
-            None if dense[0] is None else bar.dense_infos,
-            None if dense[1] is None else bar.event_dense_info,
+            bar.dense_infos if jtu.tree_leaves(given.dense_infos) else None,
+            bar.event_dense_info if jtu.tree_leaves(given.event_dense_info) else None,
         ),
     )
     gradient = back.run(bar.state, timed=any(jtu.tree_leaves(perturbed[2])))
@@ -226,6 +216,19 @@ def _backward(residuals, cotangents, perturbed, differentiable, record, remember
         at = lambda t: jnp.sum(jnp.where(handed_out.dense_ts == t, bar.dense_ts, 0))
         times = times._replace(t0=times.t0 + at(t0), t1=times.t1 + at(t1))
     return gradient.leaves, gradient.state, tuple(times), eqx.filter(forward, lambda leaf: False)
+
+
+def _rows(replay: Replay, counts: list[Any], bar: HandedOut, ends: Ends) -> list[Rows]:
+    """Of each saving, with the cotangents of its values; `counts` are times and how many of those
+    that were asked for were reached."""
+    rows = []
+    each = zip(replay.savings, counts, bar.ts, bar.ys, strict=True)
+    for saving, (times, reached), ts_bar, ys_bar in each:
+        count = saving.offset + reached
+        if saving.steps:
+            count += ends.num_accepted // saving.steps
+        rows.append(Rows(times, count, ts_bar, ys_bar))
+    return rows
 
 
 def _with_loops(solver: Any, kind: str) -> Any:
