@@ -4,10 +4,13 @@ import collections
 
 import diffrax as dfx
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
+from optimized import optimized_jit
 
 import manifold_jax as mj
+from manifold_jax._solver import explicit
 
 
 RIGID_BODY = mj.problems.rigid_body()
@@ -62,3 +65,25 @@ def test_projection_costs_no_field_and_one_jacobian_per_step(solver, stages):
     assert projected["jacobian"] == attempted
     # at least twice: before, and after an iteration; twenty iterations are the limit
     assert 2 * attempted <= projected["residual"] <= 21 * attempted
+
+
+def test_the_derivative_of_a_stage_is_computed_once(monkeypatch):
+    """XLA copies products into every kernel that needs them, but no division (`_kept`). If this
+    fails as the counts are equal, the division is not needed any more."""
+    problem = mj.problems.pendulum()
+    solver = mj.Projected(dfx.Tsit5(), problem.constraint)
+
+    def end(scale):
+        y0 = jax.tree.map(lambda leaf: scale * leaf, problem.y0)
+        state = solver.init(problem.terms, 0.0, 0.1, y0, problem.args)
+        step = solver.step(problem.terms, 0.0, 0.1, y0, problem.args, state, made_jump=False)
+        return step[0][0][0]
+
+    def operations():
+        gradients = optimized_jit(jax.vmap(jax.grad(lambda scale: end(scale))))
+        analysis = gradients.lower(jnp.linspace(0.9, 1.1, 8)).compile().cost_analysis()
+        return (analysis[0] if isinstance(analysis, list) else analysis)["flops"]
+
+    kept = operations()
+    monkeypatch.setattr(explicit, "_kept", lambda y, like: y)
+    assert kept < 0.85 * operations()
