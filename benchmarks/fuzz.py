@@ -73,6 +73,7 @@ def _in_one_process(indices: list[int], seed: int, draws: int, limit: float) -> 
             process.kill()
             process.wait()
             reader.join()
+            process.stdout.close()
 
 
 def _read(process: subprocess.Popen, lines: Queue) -> None:

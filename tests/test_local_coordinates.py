@@ -134,15 +134,20 @@ def test_every_stage_is_on_the_manifold(chart):
 
 
 @pytest.mark.parametrize(
-    ("solver", "chart"),
+    ("solver", "chart", "accuracy"),
     [
-        pytest.param(dfx.Tsit5(), "tangent", id="tsit5-tangent"),
-        pytest.param(dfx.Tsit5(), "partition", id="tsit5-partition", marks=pytest.mark.slow),
-        pytest.param(dfx.Kvaerno5(), "tangent", id="kvaerno5-tangent", marks=pytest.mark.slow),
-        pytest.param(dfx.Kvaerno5(), "partition", id="kvaerno5-partition", marks=pytest.mark.slow),
+        pytest.param(dfx.Tsit5(), "tangent", 1e-6, id="tsit5-tangent"),
+        pytest.param(dfx.Tsit5(), "partition", 1e-6, id="tsit5-partition", marks=pytest.mark.slow),
+        # Plain Kvaerno5 with accurate stages (`optimistix.Newton`): 50 steps and 1.7e-6.
+        pytest.param(
+            dfx.Kvaerno5(), "tangent", 4e-6, id="kvaerno5-tangent", marks=pytest.mark.slow
+        ),
+        pytest.param(
+            dfx.Kvaerno5(), "partition", 4e-6, id="kvaerno5-partition", marks=pytest.mark.slow
+        ),
     ],
 )
-def test_time_dependent_pytree_problem(solver, chart):
+def test_time_dependent_pytree_problem(solver, chart, accuracy):
     """Forward and backward, dense output, with an explicit and an implicit solver."""
     hook = mj.LocalCoordinates(solver, outside.constraint(), chart=CHARTS[chart])
     options = dict(
@@ -155,17 +160,17 @@ def test_time_dependent_pytree_problem(solver, chart):
     sol = mj.diffeqsolve(
         outside.terms(), hook, outside.T0, outside.T1, None, outside.y0(), saveat=saveat, **options
     )
-    check(sol.ts[0], sol.ys[0], accuracy=1e-6)
+    check(sol.ts[0], sol.ys[0], accuracy)
     used = np.isfinite(np.asarray(sol.ts[1]))
-    check(sol.ts[1][used], jax.tree.map(lambda leaf: leaf[used], sol.ys[1]), accuracy=1e-6)
+    check(sol.ts[1][used], jax.tree.map(lambda leaf: leaf[used], sol.ys[1]), accuracy)
     times = np.random.default_rng(0).uniform(outside.T0, outside.T1, size=200)
-    check(times, jax.vmap(sol.evaluate)(jnp.asarray(times)), accuracy=1e-6)
+    check(times, jax.vmap(sol.evaluate)(jnp.asarray(times)), accuracy)
     end = jax.tree.map(lambda leaf: leaf[-1], sol.ys[0])
     saveat = dfx.SaveAt(ts=ts[::-1])
     back = mj.diffeqsolve(
         outside.terms(), hook, outside.T1, outside.T0, None, end, saveat=saveat, **options
     )
-    check(back.ts, back.ys, accuracy=2e-6)
+    check(back.ts, back.ys, 2 * accuracy)
 
 
 def check(t, y, accuracy):
