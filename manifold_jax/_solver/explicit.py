@@ -23,8 +23,8 @@ from .._projection_info import ProjectionInfo
 
 
 # Equations of the vector field times stages. With up to 210 (rigid body) a loop over the stages takes
-# 1.1 to 1.3 times as long as written out ones alone, and 1.7 to 2.1 times in a batch; from 1278
-# (double pendulum) 0.7 to 0.9 times, and 1830 equations (slider-crank) compile in 0.8 to 0.9 of the time.
+# 1.1 to 1.3 times as long as written out ones alone, and 1.7 to 2.7 times in a batch; from 1278
+# (double pendulum) 0.65 to 0.9 times, and 1830 equations (slider-crank) compile in 0.8 of the time.
 # jaxlib 0.10.2 and 0.12.0.1, `python -m benchmarks.thresholds`.
 LARGEST_UNROLLED = 500
 
@@ -144,8 +144,8 @@ def _kept(y: Y, like: Y) -> Y:
 
     XLA for CPUs copies sums and products into every kernel that needs them, here the chain of all
     stages into the derivative of each, but never a division. The derivative is therefore divided
-    by a one that XLA cannot tell from other numbers. Without, gradients take 1.2 (jaxlib 0.10.2) and
-    1.5 times (0.12.0.1) as long in a batch: `python -m benchmarks.thresholds`.
+    by a one that XLA cannot tell from other numbers. Without, gradients take 1.1 (jaxlib 0.10.2) and
+    1.3 times (0.12.0.1) as long in a batch: `python -m benchmarks.thresholds`.
     """
     del like
     return y
