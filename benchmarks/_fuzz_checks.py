@@ -100,7 +100,7 @@ def _relative(states: np.ndarray, reference: np.ndarray) -> np.ndarray:
 def check_results(structure: Structure, judge: Judge, found: Any, failed: Any) -> list[Fault]:
     """Result codes, and NaN where there is success."""
     faults = []
-    okay = _is_okay(found["code"])
+    okay = is_okay(found["code"])
     # Newton's method does not always find the time of an event, with plain solvers, too.
     unfound = found["code"] == CODES.index("nonlinear_max_steps_reached")
     unfound &= structure.output == "event"
@@ -114,17 +114,17 @@ def check_results(structure: Structure, judge: Judge, found: Any, failed: Any) -
     for name, result in (("healthy", found), ("with a failing lane", failed)):
         used = np.isfinite(result["times"])
         wrong = used & ~np.all(np.isfinite(result["states"]), axis=-1)
-        lanes = np.flatnonzero(_is_okay(result["code"]) & (wrong.any(axis=1) | ~used.any(axis=1)))
+        lanes = np.flatnonzero(is_okay(result["code"]) & (wrong.any(axis=1) | ~used.any(axis=1)))
         if lanes.size > 0:
             faults.append(Fault("not finite", f"{name}: success with NaN in lane {lanes[0]}"))
     hopeless = structure.failing in ("nan-field", "nan-start", "impossible", "dependent")
     early = structure.output == "event" and structure.failing == "impossible"
-    if hopeless and not early and _is_okay(failed["code"])[FAILING]:
+    if hopeless and not early and is_okay(failed["code"])[FAILING]:
         faults.append(Fault("silent", f"success in the lane with {structure.failing}"))
     return faults
 
 
-def _is_okay(code: np.ndarray) -> np.ndarray:
+def is_okay(code: np.ndarray) -> np.ndarray:
     return (code == CODES.index("successful")) | (code == CODES.index("event_occurred"))
 
 
@@ -143,7 +143,7 @@ def check_violations(
     structure: Structure, lanes: Lanes, judge: Judge, found: Any, failed: Any
 ) -> tuple[list[Fault], float]:
     """Constraints at all values handed out; returns the largest violation, too."""
-    okay = _is_okay(found["code"])
+    okay = is_okay(found["code"])
     which, k = _points(structure, found, okay)
     values = _violations_at(structure, lanes, found, which, k)
     between = judge.between * (structure.output not in ("t1", "steps"))
@@ -197,7 +197,7 @@ def check_accuracy(
     worst, largest, where = 0.0, 0.0, ""
     length = lanes["end"] - lanes["start"]
     between = judge.between * (structure.output not in ("t1", "steps"))
-    for i in np.flatnonzero(judge.trusted & _is_okay(found["code"])):
+    for i in np.flatnonzero(judge.trusted & is_okay(found["code"])):
         k = np.flatnonzero(np.isfinite(found["times"][i]))
         k = k[np.linspace(0, k.size - 1, min(PER_LANE, k.size)).astype(int)]
         s = np.clip((found["times"][i, k] - lanes["start"][i]) / length[i], 0.0, 1.0)
@@ -222,7 +222,7 @@ def check_events(structure: Structure, lanes: Lanes, judge: Judge, found: Any) -
     off = 10 * (judge.bound + judge.between) * (1 + np.abs(level))
     crossings = _crossings(level_function(np, judge.paths(s)) - level, off)
     happened = found["code"] == CODES.index("event_occurred")
-    for i in np.flatnonzero(judge.trusted & _is_okay(found["code"])):
+    for i in np.flatnonzero(judge.trusted & is_okay(found["code"])):
         fraction = (found["times"][i, -1] - lanes["start"][i]) / length[i]
         before = crossings[int(np.clip(fraction * 800, 0, 799)), i]
         expected = level_function(np, judge.paths(np.array([fraction]))[0, i]) - level[i]
