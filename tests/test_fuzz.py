@@ -110,6 +110,21 @@ def test_every_kind_of_fault_is_seen(kinds, spoil):
 
 
 @pytest.mark.parametrize(
+    ("later", "further", "seen"),
+    [(0.0, 0.0, False), (1e-10, 1e-10, False), (0.0, 1e-10, True), (1e-7, 1e-7, True), (1e-10, 1e-9, True)],
+    ids=["equal", "later on its way", "elsewhere", "far too late", "elsewhere, and later"],
+)  # fmt: skip
+def test_a_lane_alone_may_be_later_but_not_elsewhere(later, further, seen):
+    """Of a state that moves with speed one."""
+    times = np.linspace(0.0, 1.0, 5)
+    found = {"times": times[None], "states": times[None, :, None], "num_steps": [4], "code": [0]}
+    alone = {"times": times + later, "states": times[:, None] + further, "num_steps": 4, "code": 0}
+    known = checks.Judge(None, np.ones(1), np.array([True]), np.ones(1), 0.0)
+    one = plain_structure(Quadrics(3, 1, True))
+    assert bool(checks.check_single(one, known, found, alone, 0)[0]) == seen
+
+
+@pytest.mark.parametrize(
     "family",
     [
         Linkage("matrix", 2, (-1, 0, 0), True, False),
