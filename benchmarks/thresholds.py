@@ -7,7 +7,7 @@ Ratios of run times, interleaved, medians:
 - steps with stages in a loop / written out (`LARGEST_UNROLLED` in `_solver/explicit.py`), for
   mechanisms of more and more equations, alone and in a batch, and the same ratio of compile times;
 - a gradient in a batch without / with the division that keeps XLA from computing stages again
-  (`_kept` in the same file);
+  (`derivative_once` in the same file);
 - a gradient whose steps are recorded in large blocks / in small ones (`_adjoint/sizes.py`).
 """
 
@@ -127,7 +127,7 @@ def comparisons(repeats: int) -> Iterator[Comparison]:
         jax.grad(functools.partial(end, problem)),
         functools.partial(changed, explicit),
     )
-    without = changed(explicit, _kept=lambda y, like: y)
+    without = changed(explicit, derivative_once=lambda y, like: y)
     yield compare(
         "gradient, without / with division", problem, gradient, as_it_is(), without, repeats
     )

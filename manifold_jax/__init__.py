@@ -11,37 +11,54 @@ from ._applications import (
     trace_curve as trace_curve,
 )
 from ._chart import (
+    AbstractChart as AbstractChart,
+    AbstractCoordinates as AbstractCoordinates,
     CoordinatePartitionChart as CoordinatePartitionChart,
     TangentSpaceChart as TangentSpaceChart,
 )
 from ._constraint import (
+    AbstractConstraint as AbstractConstraint,
     Constraint as Constraint,
     Invariants as Invariants,
 )
-from ._diffeqsolve import diffeqsolve as diffeqsolve
 from ._fit import fit as fit, FitResult as FitResult
-from ._initial import consistent_state as consistent_state
 from ._mechanics import (
     Baumgarte as Baumgarte,
     MechanicalSystem as MechanicalSystem,
     VelocityStabilization as VelocityStabilization,
 )
-from ._projection import (
-    NewtonProjection as NewtonProjection,
-    project as project,
-)
+from ._project import consistent_state as consistent_state, project as project
+from ._projection import NewtonProjection as NewtonProjection
 from ._projection_info import ProjectionInfo as ProjectionInfo
+from ._solve import diffeqsolve as diffeqsolve
 from ._solver import (
     LocalCoordinates as LocalCoordinates,
     Projected as Projected,
     Stabilized as Stabilized,
 )
 from ._stabilization import (
+    AbstractStabilization as AbstractStabilization,
     ExactStabilization as ExactStabilization,
     InvariantStabilization as InvariantStabilization,
 )
 from ._tangent import tangent_field as tangent_field
 from ._violation import constraint_violation as constraint_violation
+
+
+# isort: split
+# Written against the names above alone, as extensions of other people are.
+from ._lie_groups import (
+    AbstractLieGroup as AbstractLieGroup,
+    LieGroupChart as LieGroupChart,
+    SE3 as SE3,
+    SO3 as SO3,
+    UnitQuaternion as UnitQuaternion,
+)
+from ._manifolds import (
+    Product as Product,
+    Sphere as Sphere,
+    Stiefel as Stiefel,
+)
 
 
 __version__ = version("manifold_jax")

@@ -15,34 +15,98 @@ Source: Rheinboldt, Math. Comp. 43 (1984) 473-482; Wehage & Haug, J. Mech. Desig
 """
 
 import abc
+from collections.abc import Callable
 
 import equinox as eqx
 import jax
-import jax.flatten_util as jfu
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ._constraint import AbstractConstraint, jacobian, residual_vector
+from ._constraint import AbstractConstraint
 from ._custom_types import Args, RealScalarLike, Y
-from ._linear import combine, factorize, gram
-from ._mechanics import MechanicalConstraint
-from ._mechanics.constraint import Kinematics
+from ._linear import combine
 from ._projection import NewtonProjection
+from ._projection_info import ProjectionInfo
+
+
+class AbstractCoordinates(eqx.Module):
+    """Coordinates `w` near one point of the manifold, the one at which a step begins.
+
+    `w`, a pytree of arrays of any shapes, is what the solver advances: `w' = pull_back(f(t, y))`
+    at `y = lift(w)`, from `origin` on. Times are true times. All methods are traced, for one
+    trajectory, and must be differentiable. The order of the solver is kept if `lift` and
+    `pull_back` belong together: `d lift(w) / dt = f` for `w' = pull_back(f)`, up to directions
+    which `lift` does not depend on.
+    """
+
+    origin: eqx.AbstractVar[Y]  # the coordinates of the point itself
+
+    @abc.abstractmethod
+    def lift(self, t: RealScalarLike, w: Y, args: Args) -> tuple[Y, ProjectionInfo]:
+        """The point of the manifold with those coordinates at time `t`. `info.success` is false
+        where there is none; its derivative must be finite there, too."""
+
+    @abc.abstractmethod
+    def pull_back(self, t: RealScalarLike, w: Y, y: Y, vector: Y) -> Y:
+        """The velocity of the coordinates, like `w`, that belongs to a velocity `vector` of the
+        state at `y = lift(w)`. Linear in `vector`, which is tangent."""
+
+    @abc.abstractmethod
+    def push_forward(self, t: RealScalarLike, w: Y, y: Y, args: Args, error: Y) -> Y:
+        """The error of the state `y = lift(w)`, like `y`, that belongs to one of the coordinates:
+        the derivative of the lift. Tolerances are those of the state."""
 
 
 class AbstractChart(eqx.Module):
-    """How the directions `V` of a chart are chosen."""
+    """Local coordinates for [`LocalCoordinates`][], set up anew at the beginning of each step.
+
+    Implementations provide `at`. If coordinates are not themselves states near the manifold, as
+    representatives are, they provide `state`, too. No arrays but those of the state and of the
+    constraint may be needed for it: dense output keeps coordinates and the states at the beginnings
+    of steps.
+    """
 
     @abc.abstractmethod
-    def directions(
+    def at(
         self,
-        projection: NewtonProjection,
         constraint: AbstractConstraint,
+        projection: NewtonProjection,
         t: RealScalarLike,
         y: Y,
         args: Args,
-    ) -> Float[Array, "m n"]:
-        """`V^T` at the point `y`."""
+    ) -> AbstractCoordinates:
+        """Coordinates around the point `y` of the manifold at the true time `t`."""
+
+    def check(self, constraint: AbstractConstraint) -> None:
+        """Raise `ValueError` for constraints that have no such coordinates."""
+        del constraint
+
+    @property
+    def state(self) -> Callable[[Y, Y], Y] | None:
+        """`state(y, w)`: a state near the one with coordinates `w` around `y`, for dense output,
+        which is then corrected. `None` if that is `w` itself."""
+        return None
+
+
+class _Representatives(AbstractCoordinates):
+    """States modulo the span of the directions."""
+
+    constraint: AbstractConstraint
+    projection: NewtonProjection
+    directions: Float[Array, "m k"]
+    origin: Y
+
+    def lift(self, t, w, args) -> tuple[Y, ProjectionInfo]:
+        correct = self.constraint.correct
+        return correct(
+            self.projection, t, w, args, fallback=self.origin, directions=self.directions
+        )
+
+    def pull_back(self, t, w, y, vector) -> Y:
+        return vector
+
+    def push_forward(self, t, w, y, args, error) -> Y:
+        return self.constraint.push_forward(t, y, args, self.directions, error)
 
 
 class TangentSpaceChart(AbstractChart):
@@ -52,8 +116,12 @@ class TangentSpaceChart(AbstractChart):
     Source: Rheinboldt, Math. Comp. 43 (1984) 473-482.
     """
 
-    def directions(self, projection, constraint, t, y, args) -> Float[Array, "m n"]:
-        return projection.correction_directions(constraint, t, y, args)[1]
+    def at(self, constraint, projection, t, y, args) -> AbstractCoordinates:
+        directions = constraint.normals(projection, t, y, args).directions
+        return _Representatives(constraint, projection, directions, y)
+
+    def check(self, constraint: AbstractConstraint) -> None:
+        _refuse_redundant(constraint)
 
 
 class CoordinatePartitionChart(AbstractChart):
@@ -67,9 +135,21 @@ class CoordinatePartitionChart(AbstractChart):
     partitioning).
     """
 
-    def directions(self, projection, constraint, t, y, args) -> Float[Array, "m n"]:
-        G, _ = projection.correction_directions(constraint, t, y, args)
-        return G * dependent_coordinates(G)[None, :]
+    def at(self, constraint, projection, t, y, args) -> AbstractCoordinates:
+        G = constraint.normals(projection, t, y, args).jacobian
+        directions = G * dependent_coordinates(G)[None, :]
+        return _Representatives(constraint, projection, directions, y)
+
+    def check(self, constraint: AbstractConstraint) -> None:
+        _refuse_redundant(constraint)
+
+
+def _refuse_redundant(constraint: AbstractConstraint) -> None:
+    if constraint.redundant:
+        raise ValueError(
+            "`constraint` is redundant: equations that depend on each other define no local coordinates. "
+            "Remove the dependent ones, or use `mj.Projected(solver, constraint)`."
+        )
 
 
 def dependent_coordinates(G: Float[Array, "m n"]) -> Float[Array, " n"]:
@@ -87,52 +167,3 @@ def dependent_coordinates(G: Float[Array, "m n"]) -> Float[Array, " n"]:
         column = column / jnp.sqrt(jnp.where(length > 0, length, 1))
         rest = rest - column[:, None] * combine(column, rest)[None, :]
     return chosen
-
-
-def push_forward(
-    constraint: AbstractConstraint,
-    t: RealScalarLike,
-    y: Y,
-    args: Args,
-    directions: Float[Array, "m n"],
-    vector: Y,
-) -> Y:
-    """The derivative of the lift at `y` on the manifold, `e - V (G V)^-1 G e`.
-
-    Applied to an error estimate of the coordinates it gives that of the state, so that the
-    step size controller's tolerances mean what they say.
-
-    Source: Sudarsan & Keerthi, Appl. Math. Comput. 92 (1998) 153-193 (error tolerances of the
-    local coordinates).
-    """
-    t = jnp.asarray(t)
-    e, unravel = jfu.ravel_pytree(vector)
-    if isinstance(constraint, MechanicalConstraint):
-        return _push_forward_mechanics(constraint, t, y, args, directions, vector)
-    x, unravel_state = jfu.ravel_pytree(y)
-    residual = lambda x: residual_vector(constraint, t, unravel_state(x), args)
-    _, G = jacobian(residual, x)
-    return unravel(_without_normal_part(G, directions, e, combine(e, G.T)))
-
-
-def _push_forward_mechanics(constraint, t, y, args, directions, vector):
-    """Positions first; the velocities depend on them."""
-    equations = Kinematics(constraint, y)
-    x, w = equations.flat(y)
-    e_x, e_w = equations.flat(vector)
-    C, p = equations.rows(t, x, w, args)
-    if p > 0:
-        e_x = _without_normal_part(C[:p], directions[:p], e_x, combine(e_x, C[:p].T))
-    velocity = lambda x, w: equations.velocity(t, w, (x, args))
-    _, rate = jax.jvp(velocity, (x, w), (e_x, e_w))
-    e_w = _without_normal_part(C, directions, e_w, rate)
-    return equations.unravel(e_x), equations.unravel(e_w)
-
-
-def _without_normal_part(
-    G: Float[Array, "m n"],
-    directions: Float[Array, "m n"],
-    e: Float[Array, " n"],
-    rate: Float[Array, " m"],
-) -> Float[Array, " n"]:
-    return e - combine(factorize(gram(G, directions)).solve(rate), directions)

@@ -1,8 +1,6 @@
-"""The manifold `{y : g(t, y, args) = 0}`: its residual, Jacobian and row scaling."""
+"""The manifold `{y : g(t, y, args) = 0}`, and how points are corrected onto it."""
 
 import abc
-from collections.abc import Callable
-from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -11,16 +9,27 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, Float
 
-from ._custom_types import Args, RealScalarLike, Residual, ResidualFunction, Y
+from ._correction import equations_of, Normals, solve_correction, without_normal_part
+from ._custom_types import Args, BoolScalar, RealScalarLike, Residual, ResidualFunction, Y
+from ._linear import multiply
+from ._projection import NewtonProjection
+from ._projection_info import ProjectionInfo
 from ._user_function import check_function
 
 
 class AbstractConstraint(eqx.Module):
     """A manifold given by `m` equations, `g(t, y, args) = 0`.
 
-    Implementations provide `__call__`; everything else (Jacobian, scaling, the
-    number of constraints) is derived from it by the functions of this module.
-    `redundant` says whether equations may depend on each other.
+    Implementations have to provide `__call__`, the residual, and `redundant`, whether equations may
+    depend on each other. The rest has defaults for any residual; a manifold with structure
+    replaces what it knows better: how a point is corrected (`correct`), what leads across it
+    (`normals`), the part of a vector along it (`push_forward`), and what a bad start may come from
+    (`faults`).
+
+    All methods are traced: they take the state `y` (any pytree of real arrays, `n` numbers in all)
+    of one trajectory, never a batch, and must work under `jax.jit` and `jax.vmap` (no Python
+    branches on values) and be differentiable in both modes with respect to `y`, `t`, `args` and
+    the module's own arrays. Times are true times also when integrating backwards.
     """
 
     redundant: eqx.AbstractVar[bool]
@@ -40,6 +49,67 @@ class AbstractConstraint(eqx.Module):
         Any pytree of real arrays, `m <= n` numbers in all, zero on the manifold.
         """
 
+    def correct(
+        self,
+        projection: NewtonProjection,
+        t: RealScalarLike,
+        y: Y,
+        args: Args = None,
+        *,
+        fallback: Y | None = None,
+        far: bool = False,
+        directions: Float[Array, "m k"] | None = None,
+    ) -> tuple[Y, ProjectionInfo]:
+        """The point of the manifold to which `y` is moved. By default `p = y + V z`, the root of
+        `g(t, y + V z, args) = 0`, with `V` held at `y`.
+
+        **Arguments:**
+
+        - `projection`: in which norm, with how many iterations and how accurately.
+        - `fallback`: a state at which `g` is finite, `y` by default. A correction that fails has to
+            have its derivative there, finite: the zero cotangent of a rejected step must stay zero.
+        - `far`: the point is not the result of a small step, and may be anywhere.
+        - `directions`: the rows of `V^T` to correct along, if not those at `y`, from `normals`.
+
+        **Returns:**
+
+        `(p, info)`: a point like `y` and what was done. Where `info.success` is false `p` is `y`.
+        On the manifold to rounding already, `y` should stay as it is. The derivative must be that
+        of the map from `(t, y, args)` to `p`, and to first order it must not move points along the
+        manifold: the order of solvers and the error estimates rely on it.
+        """
+        fallback = y if fallback is None else fallback
+        equations = equations_of(self, t, y, args, projection, self.redundant, directions)
+        safe = jax.lax.stop_gradient(jfu.ravel_pytree(fallback)[0])
+        root = solve_correction(equations, safe, projection, far)
+        return jfu.ravel_pytree(y)[1](root.p), ProjectionInfo.of_correction(equations.x, root)
+
+    def normals(
+        self, projection: NewtonProjection, t: RealScalarLike, y: Y, args: Args = None
+    ) -> Normals:
+        """What leads across the manifold at `y`: `G = dg/dy` and the rows of `V^T = G W^-1`, both
+        `(m, k)`. `k` is `n`, unless components are moved together (positions and velocities)."""
+        return equations_of(self, t, y, args, projection, self.redundant).normals()
+
+    def push_forward(
+        self, t: RealScalarLike, y: Y, args: Args, directions: Float[Array, "m k"], vector: Y
+    ) -> Y:
+        """The derivative of the correction along `directions` at `y` on the manifold, applied to a
+        vector: `e - V (G V)^-1 G e`."""
+        equations = equations_of(self, t, y, args, NewtonProjection(), self.redundant, directions)
+        e, unravel = jfu.ravel_pytree(vector)
+        normals = equations.normals()
+        return unravel(without_normal_part(normals, e, multiply(normals.jacobian, e)))
+
+    def faults(
+        self, t: RealScalarLike, y: Y, args: Args = None
+    ) -> tuple[tuple[BoolScalar, str], ...]:
+        """What else may be wrong with a start that cannot be corrected: whether it is, and a
+        message in which `{y}` stands for the name of the state. The last one that applies is
+        reported, instead of the general ones."""
+        del t, y, args
+        return ()
+
 
 class Constraint(AbstractConstraint):
     """The manifold on which a residual function vanishes, `g(t, y, args) = 0`.
@@ -49,7 +119,7 @@ class Constraint(AbstractConstraint):
     ```
 
     The rows of the Jacobian `G = dg/dy` (shape `(m, n)`) must be linearly
-    independent near the manifold. Parameters may come through `args`, through the
+    independent near the manifold, or `redundant=True`. Parameters may come through `args`, through the
     leaves of a callable module, or through a closure; all are differentiated. Any units of
     the equations: rows are scaled by `max_j |G_ij| (|y_j| + 1)` before they are compared. States
     should not be much smaller than 1 in theirs, see [`NewtonProjection`][].
@@ -57,13 +127,18 @@ class Constraint(AbstractConstraint):
     **Arguments:**
 
     - `function`: `g(t, y, args)`, returning any pytree of real arrays.
+    - `redundant`: equations may depend on each other where they all hold, as long as they do not
+        contradict each other. The number of independent ones must be the same near the manifold. It
+        is decided anew in each correction: a combination of equations, each scaled to a gradient of
+        length one, counts as dependent if its gradient is below a hundredth of the largest.
+        Corrections then cost an eigenvalue decomposition of an `(m, m)` matrix.
 
     Use [`Invariants`][] when the constraint is "this quantity keeps its initial
     value".
     """
 
     function: ResidualFunction
-    redundant: ClassVar[bool] = False
+    redundant: bool = eqx.field(static=True, default=False, kw_only=True)
 
     def __check_init__(self):
         advice = "Write e.g. `mj.Constraint(lambda t, y, args: y @ y - 1.0)`."
@@ -87,6 +162,8 @@ class Invariants(AbstractConstraint):
     - `y0`: the state at which the values are frozen.
     - `t0`: the time at which they are frozen.
     - `args`: the `args` with which they are frozen.
+    - `redundant`: the quantities may depend on each other (energy, angular momentum and Laplace
+        vector of a planet), as for [`Constraint`][].
 
     !!! warning
 
@@ -100,140 +177,21 @@ class Invariants(AbstractConstraint):
 
     function: ResidualFunction
     values: Residual
-    redundant: ClassVar[bool] = False
+    redundant: bool = eqx.field(static=True)
 
     def __init__(
-        self, function: ResidualFunction, *, y0: Y, t0: RealScalarLike = 0.0, args: Args = None
+        self,
+        function: ResidualFunction,
+        *,
+        y0: Y,
+        t0: RealScalarLike = 0.0,
+        args: Args = None,
+        redundant: bool = False,
     ):
         check_function("function", function, "I(t, y, args)")
         self.function = function
+        self.redundant = redundant
         self.values = jtu.tree_map(jnp.asarray, function(t0, y0, args))
 
     def __call__(self, t: RealScalarLike, y: Y, args: Args = None) -> Residual:
         return jtu.tree_map(jnp.subtract, self.function(t, y, args), self.values)
-
-
-def residual_vector(
-    constraint: AbstractConstraint, t: RealScalarLike, y: Y, args: Args
-) -> Float[Array, " m"]:
-    """The residual as one vector, in the floating-point type of the state."""
-    flat, _ = jfu.ravel_pytree(constraint(t, y, args))
-    return flat
-
-
-def jacobian(
-    residual: Callable[[Float[Array, " n"]], Float[Array, " m"]], x: Float[Array, " n"]
-) -> tuple[Float[Array, " m"], Float[Array, "m n"]]:
-    """Residual and Jacobian at once: `m` pullbacks, the cheap direction as `m <= n`."""
-    r, pullback = jax.vjp(residual, x)
-    (rows,) = jax.vmap(pullback)(jnp.eye(r.shape[0], dtype=r.dtype))
-    return r, rows
-
-
-def row_scale(G: Float[Array, "m n"], x: Float[Array, " n"]) -> Float[Array, " m"]:
-    """Typical size of each residual, `max_j |G_ij| (|x_j| + 1)`.
-
-    This is row equilibration (Sudarsan & Keerthi 1998, eqs. (3.3)-(3.4), with the typical
-    sizes taken from the state).
-
-    The 1 stands for lengths that the state does not show. With the size of the state in its place
-    a third of the points beside a rod of length 1, given as displacements of 1e-3, could not be
-    corrected: the residual has rounding errors of 1e-16 whatever the displacements.
-    """
-    scale = jnp.max(jnp.abs(G) * (jnp.abs(x) + 1)[None, :], axis=1)
-    return jnp.maximum(scale, jnp.finfo(G.dtype).tiny)
-
-
-def as_time(t: RealScalarLike, dtype: Any) -> Array:
-    """A time as an array of floating point, also where it was given as a whole number."""
-    t = jnp.asarray(t)
-    return t if jnp.issubdtype(t.dtype, jnp.floating) else t.astype(dtype)
-
-
-def check_state(y: Y, name: str = "y0") -> None:
-    """Refuse, while tracing, states that are not pytrees of real floating-point arrays."""
-    if any(_is_list_of_numbers(node) for node in jtu.tree_leaves(y, is_leaf=_is_list_of_numbers)):
-        raise TypeError(
-            f"`{name}` has a list of numbers, of which JAX makes as many states as there are numbers. Make it one "
-            f"array: `{name} = jnp.array([...], float)`."
-        )
-    leaves = jtu.tree_leaves(y)
-    if len(leaves) == 0:
-        raise ValueError(
-            f"`{name}` has no array leaves: pass the state as a pytree of real arrays."
-        )
-    for leaf in leaves:
-        if not eqx.is_array_like(leaf):
-            raise TypeError(
-                f"`{name}` must be a pytree of real arrays, but has a leaf of type {type(leaf).__name__}."
-            )
-        dtype = jnp.result_type(leaf)
-        if jnp.issubdtype(dtype, jnp.complexfloating):
-            raise TypeError(
-                f"`{name}` has a complex leaf ({dtype}). Integrate its real and imaginary parts: "
-                f"pass e.g. `{name}=(z.real, z.imag)` and write the vector field and the constraint for them."
-            )
-        if not jnp.issubdtype(dtype, jnp.floating):
-            raise TypeError(
-                f"`{name}` has a leaf of type {dtype}, which cannot be moved onto a manifold. "
-                f"Convert it: `{name} = jax.tree.map(lambda leaf: jnp.asarray(leaf, float), {name})`."
-            )
-
-
-def _is_list_of_numbers(node: Any) -> bool:
-    is_number = lambda x: eqx.is_array_like(x) and jnp.ndim(x) == 0
-    return isinstance(node, list) and len(node) > 0 and all(map(is_number, node))
-
-
-def check_constraint_type(constraint: Any) -> None:
-    if isinstance(constraint, AbstractConstraint):
-        return
-    got = f"`constraint` must be an `mj.Constraint`, got {type(constraint).__name__}."
-    if isinstance(getattr(constraint, "constraint", None), AbstractConstraint):
-        raise TypeError(f"{got} Pass its manifold: `system.constraint`.")
-    if callable(constraint):
-        raise TypeError(f"{got} Wrap a residual function: `mj.Constraint(lambda t, y, args: ...)`.")
-    raise TypeError(f"{got} The constraint comes first: `(constraint, t, y, args)`.")
-
-
-def check_constraint(constraint: AbstractConstraint, t: RealScalarLike, y: Y, args: Args) -> int:
-    """Refuse, while tracing, constraints of the wrong type or shape; returns `m`."""
-    check_constraint_type(constraint)
-    try:
-        out = eqx.filter_eval_shape(constraint, t, y, args)
-    except Exception as error:
-        if isinstance(error, TypeError) and ("cond" in str(error) or "branch" in str(error)):
-            raise TypeError(
-                "`constraint` must return the same number of equations in every branch of `jax.lax.cond` or "
-                "`jax.lax.switch`; multiply an equation that is switched off by zero."
-            ) from error
-        shapes = jtu.tree_map(jnp.shape, y)
-        error.add_note(
-            f"This is what `constraint` said of a state of shapes {shapes}. Is it one state, as the function expects "
-            "it? Saved states need their times: `mj.constraint_violation(constraint, sol.ts, sol.ys, args)`."
-        )
-        raise
-    leaves = jtu.tree_leaves(out)
-    for leaf in leaves:
-        if not isinstance(leaf, jax.ShapeDtypeStruct | float):
-            raise TypeError(
-                "`constraint` must return a pytree of real arrays, but its residual has a leaf of type "
-                f"{type(leaf).__name__}. Return e.g. `jnp.stack([g1, g2])`."
-            )
-        if isinstance(leaf, jax.ShapeDtypeStruct) and not jnp.issubdtype(leaf.dtype, jnp.floating):
-            raise TypeError(
-                f"`constraint` returned a residual of type {leaf.dtype}; it must be real floating-point. "
-                "For complex equations return their real and imaginary parts."
-            )
-    m = sum(leaf.size if isinstance(leaf, jax.ShapeDtypeStruct) else 1 for leaf in leaves)
-    n = sum(jnp.size(leaf) for leaf in jtu.tree_leaves(y))
-    if m == 0:
-        raise ValueError(
-            "`constraint` returned an empty residual; without constraints use the solver alone."
-        )
-    if m > n and not constraint.redundant:
-        raise ValueError(
-            f"`constraint` returned {m} residuals for a state of {n} numbers; at most {n} independent "
-            "equations can hold. Remove dependent rows (of a symmetric matrix equation keep the upper triangle)."
-        )
-    return m

@@ -47,17 +47,40 @@ class CorrectedInterpolation(dfx.AbstractLocalInterpolation):
         return jtu.tree_map(jnp.add, bent, jax.lax.stop_gradient(rest))
 
 
+class InterpolationOfCoordinates(dfx.AbstractLocalInterpolation):
+    """The states that belong to interpolated coordinates around the state `start`."""
+
+    t0: RealScalarLike
+    t1: RealScalarLike
+    inner: dfx.AbstractLocalInterpolation
+    start: Y
+    state: Callable[[Y, Y], Y] = eqx.field(static=True)
+
+    def evaluate(
+        self, t0: RealScalarLike, t1: RealScalarLike | None = None, left: bool = True
+    ) -> Y:
+        if t1 is not None:
+            return jtu.tree_map(jnp.subtract, self.evaluate(t1), self.evaluate(t0))
+        return self.state(self.start, self.inner.evaluate(t0, left=left))
+
+
 class CorrectedInterpolationFactory(eqx.Module):
     """Builds [`CorrectedInterpolation`][] from the `dense_info` of a step.
 
-    Diffrax keeps `interpolation_cls` in a static field, so this holds no arrays.
+    Diffrax keeps `interpolation_cls` in a static field, so this holds no arrays. `state(start, w)`
+    makes a state of what the solver interpolates, if that is something else.
     """
 
     inner: Callable[..., dfx.AbstractLocalInterpolation] = eqx.field(static=True)
     bend: bool = eqx.field(static=True)
+    state: Callable[[Y, Y], Y] | None = eqx.field(static=True, default=None)
 
-    def __call__(self, *, t0, t1, corrected, correction, **info) -> dfx.AbstractLocalInterpolation:
+    def __call__(
+        self, *, t0, t1, corrected, correction, start=None, **info
+    ) -> dfx.AbstractLocalInterpolation:
         inner = self.inner(t0=t0, t1=t1, **info)
+        if self.state is not None:
+            inner = InterpolationOfCoordinates(t0, t1, inner, start, self.state)
         if not self.bend:
             return inner
         return CorrectedInterpolation(
@@ -91,7 +114,7 @@ class ManifoldInterpolation(dfx.AbstractPath):
         """`t` and `y` are any time and state."""
 
         def correct(t: Array, y: Y) -> Y:
-            corrected, info = projection(constraint, t, y, args)
+            corrected, info = constraint.correct(projection, t, y, args)
             return jtu.tree_map(lambda leaf: jnp.where(info.success, leaf, jnp.nan), corrected)
 
         correct = eqx.filter_closure_convert(correct, t, y)

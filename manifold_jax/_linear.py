@@ -5,17 +5,22 @@ mechanism and cannot be fused across a batch. Up to `UNROLL_LIMIT` rows the elim
 is therefore written out entry by entry; beyond that the library routine is used.
 """
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.scipy.linalg as jsl
 from jaxtyping import Array, Float
 
-from ._custom_types import BoolScalar
+from ._custom_types import BoolScalar, FloatScalar
 
 
 # Number of operations grows like m^3 / 3: 170 at m = 8, still less than one library call.
 UNROLL_LIMIT = 8
+
+# Columns up to which an elimination with row exchanges is written out.
+_UNROLLED_COLUMNS = 4
 
 
 class Factorization(eqx.Module):
@@ -72,7 +77,7 @@ def factorize(
     if threshold is None:
         threshold = 10 * m * float(jnp.finfo(A.dtype).eps)
     if redundant:
-        return _pseudo_invert(A)
+        return pseudo_invert(A)
     if m > UNROLL_LIMIT:
         return _factorize_with_library(A, threshold)
     lu = [[A[i, j] for j in range(m)] for i in range(m)]
@@ -93,10 +98,21 @@ def factorize(
 _DEPENDENT = 1e-4
 
 
-def _pseudo_invert(A: Float[Array, "m m"]) -> PseudoInverse:
+def pseudo_invert(
+    A: Float[Array, "m m"], *, equilibrated: bool = False, dependent: Any = _DEPENDENT
+) -> PseudoInverse:
+    """Of a symmetric positive semidefinite matrix; `equilibrated` with its diagonal scaled to one,
+    so that the units of equations do not decide which of them depend on others. Eigenvalues below
+    `dependent` times the largest count as zero."""
     finite = jnp.all(jnp.isfinite(A))
     A = jnp.where(finite, A, jnp.eye(A.shape[0], dtype=A.dtype))
-    return PseudoInverse(jnp.linalg.pinv(A, rtol=_DEPENDENT, hermitian=True), finite)
+    scale = jnp.ones_like(A)
+    if equilibrated:
+        diagonal = jax.lax.stop_gradient(jnp.diagonal(A))
+        size = jnp.where(diagonal > 0, 1 / jnp.sqrt(jnp.where(diagonal > 0, diagonal, 1)), 1)
+        scale = size[:, None] * size[None, :]
+    inverse = scale * jnp.linalg.pinv(scale * A, rtol=dependent, hermitian=True)
+    return PseudoInverse(inverse, finite)
 
 
 def _factorize_with_library(A: Float[Array, "m m"], threshold: float) -> Factorization:
@@ -134,3 +150,44 @@ def multiply(A: Float[Array, "m n"], x: Float[Array, " n"]) -> Float[Array, " m"
     if A.shape[1] > UNROLL_LIMIT:
         return gram(A, x[None, :])[:, 0]
     return combine(x, A.T)
+
+
+class Elimination(eqx.Module):
+    """`A^-1` of any regular square matrix, by elimination with row exchanges. Not finite if `A` is
+    singular."""
+
+    A: Float[Array, "n n"]
+
+    def solve(self, b: Float[Array, "n ..."]) -> Float[Array, "n ..."]:
+        A = self.A
+        return jax.lax.custom_linear_solve(
+            lambda x: A @ x,
+            b,
+            lambda _, b: reduction(A)[0] @ b,
+            lambda _, b: reduction(A)[0].T @ b,
+        )
+
+
+def reduction(A: Float[Array, "n k"]) -> tuple[Float[Array, "n n"], FloatScalar]:
+    """`E` with `E A = 1` (or `[1; 0]` if `k < n`) and the sign of `det E`, by Gauss-Jordan
+    elimination with row exchanges. Not finite if the columns of `A` are dependent.
+
+    Without LAPACK: batched factorizations can wait for each other for ever on the CPU. Seen with
+    jaxlib 0.10.2 on two cores: two that do not depend on each other, under `vmap` in one large
+    program, each held a thread of XLA's pool and waited there for tasks in the queue of the pool.
+    """
+    n, k = A.shape
+    rows = jnp.arange(n)
+
+    def column(j, state):
+        M, sign = state
+        p = jnp.argmax(jnp.where(rows >= j, jnp.abs(M[:, j]), -1))
+        sign = sign * jnp.sign(M[p, j]) * jnp.where(p == j, 1, -1)
+        pivot_row = M[p] / M[p, j]
+        M = jnp.where((rows == p)[:, None], M[j][None], M)
+        M = jnp.where((rows == j)[:, None], pivot_row[None], M - jnp.outer(M[:, j], pivot_row))
+        return M, sign
+
+    start = jnp.concatenate([A, jnp.eye(n, dtype=A.dtype)], axis=1), jnp.ones((), A.dtype)
+    M, sign = jax.lax.fori_loop(0, k, column, start, unroll=k <= _UNROLLED_COLUMNS)
+    return M[:, k:], sign

@@ -1,10 +1,11 @@
-"""The root of the correction: `z` in `g(t, x + V z, args) = 0`, and its derivative.
+"""Newton's method for as many equations as unknowns, and the derivative of their root.
 
-Vectors only; states as pytrees are the business of `_projection.py`.
+`r(z) = residual(point(z))` with unknowns `z` and the point to which they belong. Vectors only.
 """
 
+import abc
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import equinox as eqx
 import jax
@@ -12,57 +13,35 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, Float
 
-from ._constraint import jacobian, row_scale
-from ._custom_types import Args, BoolScalar, FloatScalar, IntScalar
-from ._linear import combine, Factorization, factorize, gram, PseudoInverse
+from ._custom_types import BoolScalar, FloatScalar, IntScalar
 
 
-class CorrectionProblem(NamedTuple):
-    """Everything the root depends on differentiably."""
+@runtime_checkable
+class Linearization(Protocol):
+    """The matrix `dr/dz`, factored."""
 
-    residual: Callable
-    t: Array
-    x: Float[Array, " n"]
-    args: Args
-    inverse_metric: Float[Array, " n"] | None = None
-    rows: Float[Array, "m n"] | None = None  # `V^T` where it does not depend on `x`
-    redundant: bool = False
-
-    def g(self, x: Float[Array, " n"]) -> Float[Array, " m"]:
-        return self.residual(self.t, x, self.args)
-
-    def weighted(self, G: Float[Array, "m n"]) -> Float[Array, "m n"]:
-        """`V^T = G W^-1`, the directions as rows, unless they are given."""
-        if self.rows is not None:
-            return self.rows
-        return G if self.inverse_metric is None else G * self.inverse_metric[None, :]
-
-    def displaced(self, z: Float[Array, " m"]) -> Float[Array, " n"]:
-        """`x + V z` without forming `V`."""
-        if self.rows is not None:
-            return self.x + combine(z, self.rows)
-        _, pullback = jax.vjp(self.g, self.x)
-        (d,) = pullback(z)
-        return self.x + (d if self.inverse_metric is None else self.inverse_metric * d)
+    def solve(self, b: Float[Array, " m"]) -> Float[Array, " m"]: ...
 
 
-class CorrectionRoot(NamedTuple):
-    """The corrected point, its multipliers, and how it went."""
+class AbstractEquations(eqx.Module):
+    """`m` equations in `m` unknowns. All that a root depends on are leaves."""
 
-    p: Float[Array, " n"]
-    z: Float[Array, " m"]
-    iterations: IntScalar
-    residual: FloatScalar
-    full_rank: BoolScalar
-    success: BoolScalar
+    @abc.abstractmethod
+    def point(self, z: Float[Array, " m"]) -> Float[Array, " n"]:
+        """Where the unknowns lead."""
+
+    @abc.abstractmethod
+    def residual(self, x: Float[Array, " n"]) -> Float[Array, " m"]:
+        """At a point."""
+
+    @abc.abstractmethod
+    def linearize(self, x: Float[Array, " n"]) -> Linearization:
+        """The derivative of the residual with respect to the unknowns, at a point."""
 
 
-# Scaled residual, in rounding units, at which nothing more can be gained. At 4 units the
-# circle of the paper's Example 2.1 is left by up to 1.8e-15, at half a unit by 4.4e-16.
-_ROUNDING = 0.5
+class Iterate(NamedTuple):
+    """Unknowns, their residual, its largest scaled component, and how it went."""
 
-
-class _Iterate(NamedTuple):
     z: Float[Array, " m"]
     r: Float[Array, " m"]
     level: FloatScalar  # max_i |r_i| / scale_i
@@ -70,169 +49,147 @@ class _Iterate(NamedTuple):
     progress: BoolScalar  # whether the last iteration lowered the residual
 
 
-class _Equations(NamedTuple):
-    """The `m` equations `g(t, x + V z, args) = 0` in the multipliers `z`."""
+class _Search(NamedTuple):
+    """Equations with the typical sizes by which their residuals are measured."""
 
-    problem: CorrectionProblem
-    directions: Float[Array, "m n"]
+    equations: AbstractEquations
     scale: Float[Array, " m"]
 
-    def point(self, z: Float[Array, " m"]) -> Float[Array, " n"]:
-        return self.problem.x + combine(z, self.directions)
+    def start(self, z: Float[Array, " m"], r: Float[Array, " m"]) -> Iterate:
+        return Iterate(z, r, self.level(r), jnp.zeros((), jnp.int32), jnp.asarray(True))
 
     def at(self, z: Float[Array, " m"]) -> tuple[Float[Array, " m"], FloatScalar]:
-        r = self.problem.g(self.point(z))
+        r = self.equations.residual(self.equations.point(z))
         return r, self.level(r)
 
     def level(self, r: Float[Array, " m"]) -> FloatScalar:
         return jnp.max(jnp.abs(r) / self.scale)
 
-    def lowered(self, state: _Iterate, dz: Float[Array, " m"]) -> _Iterate:
+    def lowered(self, state: Iterate, dz: Float[Array, " m"]) -> Iterate:
         """The step `z - dz` if it lowers the residual, else the state as it was."""
         z = state.z - dz
         r, level = self.at(z)
         progress = level < state.level
-        kept = jtu.tree_map(
+        best = jtu.tree_map(
             lambda new, old: jnp.where(progress, new, old), (z, r, level), state[:3]
         )
-        return _Iterate(*kept, state.iterations + 1, progress)
+        return Iterate(*best, state.iterations + 1, progress)
 
 
-def _chord(
-    equations: _Equations,
+# Scaled residual, in rounding units, at which nothing more can be gained. At 4 units the
+# circle of the paper's Example 2.1 is left by up to 1.8e-15, at half a unit by 4.4e-16.
+_ROUNDING = 0.5
+
+
+def chord(
+    equations: AbstractEquations,
+    linearization: Linearization,
+    z: Float[Array, " m"],
     r: Float[Array, " m"],
-    factorization: Factorization | PseudoInverse,
+    scale: Float[Array, " m"],
     max_steps: int,
-) -> _Iterate:
-    """Simplified Newton: one factorization throughout. Two iterations are nearly always
-    enough, and are written out so that they fuse with the step around them.
+) -> Iterate:
+    """Simplified Newton from `z` with residual `r`: one factorization throughout. Two iterations
+    are nearly always enough, and are written out so that they fuse with what is around them.
 
-    A point that is on the manifold to rounding stays where it is: a correction of that size is
+    A point that is a root to rounding stays where it is: a correction of that size is
     large for a component that is small."""
-    z, level = jnp.zeros_like(r), equations.level(r)
-    needed = level > _ROUNDING * jnp.finfo(r.dtype).eps
-    for _ in range(min(2, max_steps)):
-        z = jnp.where(needed, z - factorization.solve(r), z)
-        r, level = equations.at(z)
+    search = _Search(equations, scale)
+    written_out = min(2, max_steps)
+    rounding = _ROUNDING * jnp.finfo(r.dtype).eps
+    level = search.level(r)
+    needed = level > rounding
+    for _ in range(written_out):
+        z = jnp.where(needed, z - linearization.solve(r), z)
+        r, level = search.at(z)
     return jax.lax.while_loop(
-        lambda s: (
-            (s.level > _ROUNDING * jnp.finfo(r.dtype).eps) & s.progress & (s.iterations < max_steps)
-        ),
-        lambda s: equations.lowered(s, factorization.solve(s.r)),
-        _Iterate(z, r, level, jnp.asarray(min(2, max_steps), jnp.int32), jnp.asarray(True)),
+        lambda s: (s.level > rounding) & s.progress & (s.iterations < max_steps),
+        lambda s: search.lowered(s, linearization.solve(s.r)),
+        Iterate(z, r, level, jnp.asarray(written_out, jnp.int32), jnp.asarray(True)),
     )
 
 
-def _damped_newton(
-    equations: _Equations, r: Float[Array, " m"], max_steps: int, tolerance: Any
-) -> _Iterate:
-    """A new Jacobian in every iteration, and a quarter of the step while the residual grows."""
+def damped_newton(
+    equations: AbstractEquations,
+    z: Float[Array, " m"],
+    r: Float[Array, " m"],
+    scale: Float[Array, " m"],
+    max_steps: int,
+    tolerance: Any,
+) -> Iterate:
+    """A new Jacobian in every iteration, and a quarter of the step while the residual grows,
+    unless it is below `tolerance` already."""
+    search = _Search(equations, scale)
 
-    def unfinished(carry: tuple[_Iterate, FloatScalar]) -> BoolScalar:
+    def unfinished(carry: tuple[Iterate, FloatScalar]) -> BoolScalar:
         s, _ = carry
         stalled = ~s.progress & (s.level <= tolerance)
         rounded = s.level <= _ROUNDING * jnp.finfo(r.dtype).eps
         return ~rounded & ~stalled & (s.iterations < max_steps)
 
-    def advance(carry: tuple[_Iterate, FloatScalar]) -> tuple[_Iterate, FloatScalar]:
+    def advance(carry: tuple[Iterate, FloatScalar]) -> tuple[Iterate, FloatScalar]:
         s, damping = carry
-        _, G = jacobian(equations.problem.g, equations.point(s.z))
-        redundant = equations.problem.redundant
-        dz = factorize(gram(G, equations.directions), redundant).solve(s.r)
-        s = equations.lowered(s, damping * dz)
+        dz = equations.linearize(equations.point(s.z)).solve(s.r)
+        s = search.lowered(s, damping * dz)
         return s, jnp.where(s.progress, jnp.ones_like(damping), damping / 4)
 
-    level = equations.level(r)
-    start = _Iterate(jnp.zeros_like(r), r, level, jnp.zeros((), jnp.int32), jnp.asarray(True))
-    return jax.lax.while_loop(unfinished, advance, (start, jnp.ones_like(level)))[0]
+    start = search.start(z, r)
+    return jax.lax.while_loop(unfinished, advance, (start, jnp.ones_like(start.level)))[0]
 
 
-class Linearization(NamedTuple):
-    """The Jacobian at the point that is corrected, and `G V`, factored."""
-
-    G: Float[Array, "m n"]
-    factorization: Factorization | PseudoInverse
-
-
-def linearize(problem: CorrectionProblem) -> Linearization:
-    _, G = jacobian(problem.g, problem.x)
-    return Linearization(G, factorize(gram(G, problem.weighted(G)), problem.redundant))
+def find_root(
+    equations: AbstractEquations, guess: Float[Array, " n"], max_steps: int = 50
+) -> Float[Array, " n"]:
+    """For as long as every step lowers `max_i |r_i|`: the best point found. Simple roots are found
+    to round-off."""
+    r = equations.residual(equations.point(guess))
+    return damped_newton(equations, guess, r, jnp.ones_like(r), max_steps, jnp.inf).z
 
 
-def correct_once(
-    problem: CorrectionProblem,
-    safe: Float[Array, " n"],
-    linearization: Linearization | None = None,
-) -> CorrectionRoot:
-    """One Newton step, `x - V (G V)^-1 g(x)`, successful if it lowers the residual.
+class ImplicitTangent(NamedTuple):
+    """How a root moves: `dz`, how the point would move with the unknowns held fixed, and the
+    derivatives there."""
 
-    Differentiated as it stands: it is a map of its own, not an approximation of the root.
+    dz: Float[Array, " m"]
+    moved: Float[Array, " n"]
+    linearization: Linearization
+
+
+def implicit_tangent(
+    equations: AbstractEquations, tangent: Any, z: Float[Array, " m"]
+) -> ImplicitTangent:
+    """The derivative of the root `z` along `tangent`, that of the leaves of `equations`:
+
+        r(z, theta) = 0:  dz = -(dr/dz)^-1 (dr/dtheta) dtheta.
+
+    How the root was found does not matter. Can itself be differentiated.
     """
-    finite = jnp.all(jnp.isfinite(problem.x))
-    problem = problem._replace(x=jnp.where(finite, problem.x, safe))
-    G, factorization = linearize(problem) if linearization is None else linearization
-    equations = _Equations(problem, problem.weighted(G), row_scale(G, problem.x))
-    r = problem.g(problem.x)
-    z = -factorization.solve(r)
-    before, (_, after) = equations.level(r), equations.at(z)
-    rounding = 50 * jnp.finfo(r.dtype).eps
-    success = finite & factorization.full_rank & (after <= jnp.maximum(before, rounding))
-    p = jnp.where(success, equations.point(z), problem.x)
-    residual = jnp.where(finite, after, jnp.nan)
-    iterations = jnp.ones((), jnp.int32)
-    return CorrectionRoot(p, z, iterations, residual, factorization.full_rank, success)
+    point, moved = _derivative(lambda e: e.point(z), equations, tangent)
+    along = lambda both: both[0].residual(both[1])
+    _, slope = _derivative(along, (equations, point), (tangent, moved))
+    linearization = equations.linearize(point)
+    return ImplicitTangent(-linearization.solve(slope), moved, linearization)
+
+
+def _derivative(f: Callable, x: Any, tangent: Any) -> tuple[Array, Array]:
+    value, slope = eqx.filter_jvp(f, (x,), (tangent,))
+    return value, jnp.zeros_like(value) if slope is None else slope
 
 
 @eqx.filter_custom_jvp
-def solve_correction(
-    problem: CorrectionProblem,
-    safe: Float[Array, " n"],
-    max_steps: int,
-    tolerance: Any,
-    far: bool,
-    linearization: Linearization | None = None,
-) -> CorrectionRoot:
-    """Solve `g(t, x + V z, args) = 0` for `z`.
-
-    The derivative of a failed correction is taken at `safe`. Corrections that share a
-    Jacobian and its factorization pass them on as `linearization`.
-    """
-    del safe
-    G, factorization = linearize(problem) if linearization is None else linearization
-    r = problem.g(problem.x)
-    equations = _Equations(problem, problem.weighted(G), row_scale(G, problem.x))
-    if far:
-        root = _damped_newton(equations, r, max_steps, tolerance)
-    else:
-        root = _chord(equations, r, factorization, max_steps)
-    success = (root.level <= tolerance) & factorization.full_rank
-    p = jnp.where(success, equations.point(root.z), problem.x)
-    return CorrectionRoot(p, root.z, root.iterations, root.level, factorization.full_rank, success)
+def implicit_root(equations: AbstractEquations, root: Float[Array, " m"]) -> Float[Array, " m"]:
+    """`root` itself, as the function of the leaves of `equations` that they define."""
+    del equations
+    return root
 
 
-# Differentiate g(p, theta) = 0 with p = x + V(x, theta) z:
-#     G(p) (dx + d[V] z + V dz) + g_theta dtheta = 0
-#     dz = -(G(p) V)^-1 (G(p) (dx + d[V] z) + g_theta dtheta),   dp = dx + d[V] z + V dz.
-# `d[V] z` is the curvature term: the derivative of `V z` at fixed `z`. Everything is written
-# in terms of the output root, so that the rule can itself be differentiated.
-@solve_correction.def_jvp
-def _derivative(primals, tangents):
-    problem, safe, *_ = primals
-    problem_dot, *_ = tangents
-    root = solve_correction(*primals)
-    # A failed projection may have met NaN. Move to a point where g is finite *before*
-    # differentiating: selecting afterwards would leave 0 * NaN in reverse mode.
-    problem = problem._replace(x=jnp.where(root.success, problem.x, safe))
-    p = jnp.where(root.success, root.p, safe)
-    z = jnp.where(root.success, root.z, 0)
+@implicit_root.def_jvp
+def _implicit_root_jvp(primals, tangents):
+    equations, root = primals
+    root = implicit_root(equations, root)  # of which the rule can be differentiated again
+    return root, implicit_tangent(equations, tangents[0], root).dz
 
-    _, moved = eqx.filter_jvp(lambda q: q.displaced(z), (problem,), (problem_dot,))
-    zero = jnp.zeros_like(problem.x)
-    moved = zero if moved is None else moved
-    _, slope = eqx.filter_jvp(lambda q, p: q.g(p), (problem, p), (problem_dot, moved))
-    directions = problem.weighted(jacobian(problem.g, problem.x)[1])
-    B = gram(jacobian(problem.g, p)[1], directions)
-    dz = -factorize(B, problem.redundant).solve(slope)
-    p_dot = moved + combine(dz, directions)
-    root_dot = CorrectionRoot(p_dot, dz, None, jnp.zeros_like(root.residual), None, None)
-    return root, root_dot
+
+def without_derivative(tree: Any) -> Any:
+    """`tree` with all its arrays held fixed."""
+    return jtu.tree_map(lambda x: jax.lax.stop_gradient(x) if eqx.is_inexact_array(x) else x, tree)

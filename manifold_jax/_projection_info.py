@@ -11,8 +11,8 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Float
 
+from ._correction import CorrectionRoot
 from ._custom_types import BoolScalar, FloatScalar, IntScalar, Y
-from ._newton import CorrectionRoot
 
 
 class ProjectionInfo(eqx.Module):
@@ -49,6 +49,33 @@ class ProjectionInfo(eqx.Module):
         none = jnp.zeros((0,), dtype)
         return ProjectionInfo(
             none, jnp.zeros((), jnp.int32), zero, zero, jnp.asarray(True), success
+        )
+
+    @staticmethod
+    def of_formula(y: Y, p: Y, residual: FloatScalar, success: BoolScalar) -> "ProjectionInfo":
+        """For a constraint that corrects itself by a formula: no iterations and no multipliers.
+        `residual` is the scaled residual at the point `p` to which `y` was moved."""
+
+        def distance(a: Array, b: Array) -> FloatScalar:
+            return jnp.max(jnp.abs(b - a) / (jnp.abs(a) + 1), initial=0.0)
+
+        distances = jtu.tree_leaves(jtu.tree_map(distance, y, p))
+        correction = jax.lax.stop_gradient(functools.reduce(jnp.maximum, distances))
+        return dataclasses.replace(
+            ProjectionInfo.of_nothing(y, success), residual=residual, correction=correction
+        )
+
+    @staticmethod
+    def of_parts(*parts: "ProjectionInfo") -> "ProjectionInfo":
+        """For a state whose parts have been corrected one by one."""
+        joined = lambda combine, name: functools.reduce(combine, [getattr(p, name) for p in parts])
+        return ProjectionInfo(
+            multipliers=jnp.concatenate([part.multipliers for part in parts]),
+            iterations=joined(jnp.add, "iterations"),
+            residual=joined(jnp.maximum, "residual"),
+            correction=joined(jnp.maximum, "correction"),
+            full_rank=joined(jnp.logical_and, "full_rank"),
+            success=joined(jnp.logical_and, "success"),
         )
 
     @staticmethod

@@ -6,30 +6,43 @@ With `V = W^-1 G^T`, so that `G^+ = V (G V)^-1` is a generalized inverse of `G`,
 
 import abc
 from collections.abc import Callable
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
-import diffrax as dfx
 import equinox as eqx
 import jax
 import jax.flatten_util as jfu
 import jax.numpy as jnp
 import jax.tree_util as jtu
-import numpy as np
 
-from ._constraint import AbstractConstraint, jacobian, residual_vector
-from ._custom_types import Args, BoolScalar, RealScalarLike, Y
-from ._linear import combine, factorize, gram
-from ._mechanics.stabilization import refuse_negative
+from ._constraint import AbstractConstraint
+from ._correction import equations_of, solve_correction
+from ._custom_types import Args, RealScalarLike, Y
+from ._linear import combine
 from ._projection import NewtonProjection
+from ._stability import refuse_negative
 
 
 Field: TypeAlias = Callable[[RealScalarLike, Y, Args], Y]
 
 
 class AbstractStabilization(eqx.Module):
-    """A modification of a vector field `f`, given as a function of true time."""
+    """A modification of a vector field `f`, after which violations decay, for [`Stabilized`][].
 
-    gain: eqx.AbstractVar[RealScalarLike]
+    Implementations provide `field`, and say by `rate` how stiff it is, by `ends_on_manifold`
+    whether the ends of steps are to be corrected.
+    """
+
+    @property
+    @abc.abstractmethod
+    def rate(self) -> RealScalarLike:
+        """The largest rate of decay, 1/time. Steps `h` with `rate * h` beyond the stability
+        interval of the solver are rejected; 0 if it is for the error estimate to see."""
+
+    @property
+    def ends_on_manifold(self) -> bool:
+        """Whether every step is to end on the manifold, with all that is handed out. Known while
+        tracing."""
+        return False
 
     @abc.abstractmethod
     def field(
@@ -42,7 +55,11 @@ class AbstractStabilization(eqx.Module):
         y: Y,
         args: Args,
     ) -> Y:
-        """The stabilized field at `t`, `y`; `sign` is the direction of integration."""
+        """The stabilized field at the true time `t` and the state `y` of one trajectory, like `y`.
+
+        `sign` is the direction of integration: what decays forwards in time must be multiplied
+        by it to decay backwards, too. NaN where the field is not defined: such a step is rejected.
+        """
 
 
 class InvariantStabilization(AbstractStabilization):
@@ -71,20 +88,23 @@ class InvariantStabilization(AbstractStabilization):
     def __check_init__(self):
         refuse_negative("gain", self.gain)
 
+    @property
+    def rate(self) -> RealScalarLike:
+        return self.gain
+
     def field(self, f, constraint, projection, sign, t, y, args):
         derivative = f(t, y, args)
-        x, unravel = jfu.ravel_pytree(y)
-        w, _ = jfu.ravel_pytree(derivative)
-        t = jnp.asarray(t, x.dtype)
-        residual = lambda t, x: residual_vector(constraint, t, unravel(x), args)
-        r, G = jacobian(lambda x: residual(t, x), x)
-        rate = sign * self.gain * r
+        w, unravel = jfu.ravel_pytree(derivative)
+        # Of the whole state, whatever structure the constraint has: components are not moved apart.
+        equations = equations_of(constraint, t, y, args, projection, constraint.redundant)
+        x, t = equations.x, equations.t
+        crossing = equations.crossing()
+        rate = sign * self.gain * equations.residual(x)
         if self.projected:
+            residual = lambda t, x: equations.function(t, x, equations.args)
             rate = rate + jax.jvp(residual, (t, x), (jnp.ones_like(t), w))[1]
-        V = projection.weighted(G, y)
-        factorization = factorize(gram(G, V), constraint.redundant)
-        undefined = jnp.where(factorization.full_rank, 0, jnp.nan).astype(w.dtype)
-        return unravel(w - combine(factorization.solve(rate), V) + undefined)
+        undefined = jnp.where(crossing.factorization.full_rank, 0, jnp.nan).astype(w.dtype)
+        return unravel(w - combine(crossing.solve(rate), crossing.normals.directions) + undefined)
 
 
 class ExactStabilization(AbstractStabilization):
@@ -112,60 +132,28 @@ class ExactStabilization(AbstractStabilization):
         refuse_negative("gain", self.gain)
 
     @property
+    def rate(self) -> RealScalarLike:
+        return self.gain
+
+    @property
     def ends_on_manifold(self) -> bool:
         return isinstance(self.gain, int | float) and self.gain == 0
 
     def field(self, f, constraint, projection, sign, t, y, args):
-        whole = _WholeState(constraint)
-        point, info = projection(whole, t, y, args)
+        # Of the whole state, the nearest point in all components.
+        equations = equations_of(constraint, t, y, args, projection, constraint.redundant)
+        x, unravel = equations.x, jfu.ravel_pytree(y)[1]
+        root = solve_correction(equations, jax.lax.stop_gradient(x), projection, False)
         if not self.ends_on_manifold:
             # Again along the normals at that point: the nearest one to one more order, without
             # which the change of the distance would have a part of the size of its square.
-            _, directions = projection.correction_directions(whole, t, point, args)
-            point, info = projection(whole, t, y, args, directions=directions)
-        undefined = jnp.where(info.success, 0.0, jnp.nan)
+            normals = equations.starting_at(root.p).normals()
+            again = equations.along(normals.directions)
+            root = solve_correction(again, jax.lax.stop_gradient(x), projection, False)
+        point = unravel(root.p)
+        undefined = jnp.where(root.success, 0.0, jnp.nan)
 
         def stabilized(derivative, p, y):
             return derivative + sign * self.gain * (p - y) + undefined.astype(p.dtype)
 
         return jtu.tree_map(stabilized, f(t, point, args), point, y)
-
-
-class _WholeState(AbstractConstraint):
-    """A constraint corrected as one, not positions first: the nearest point in all components."""
-
-    constraint: AbstractConstraint
-
-    @property
-    def redundant(self) -> bool:
-        return self.constraint.redundant
-
-    def __call__(self, t: RealScalarLike, y: Y, args: Args = None) -> Any:
-        return self.constraint(t, y, args)
-
-
-def is_stable(gain: RealScalarLike, step: RealScalarLike, solver: dfx.AbstractSolver) -> BoolScalar:
-    """Whether `exp(-gain t)` is approximated by something that decays."""
-    gain = jnp.asarray(gain)
-    # Rounding of a step at the limit itself does not count.
-    return (gain >= 0) & (gain * jnp.abs(step) <= 1.0001 * stability_interval(solver))
-
-
-def stability_interval(solver: dfx.AbstractSolver) -> float:
-    """The largest `x` with `|R(-s)| <= 1` for all `0 <= s <= x`, `R` the stability function
-    of an explicit Runge-Kutta method; infinite for other solvers."""
-    tableau: Any = getattr(solver, "tableau", None)
-    if not isinstance(solver, dfx.AbstractERK) or not isinstance(tableau, dfx.ButcherTableau):
-        return 2.0 if isinstance(solver, dfx.Euler) else float("inf")
-    stages = tableau.num_stages
-    A = np.zeros((stages, stages))
-    for i, row in enumerate(tableau.a_lower):
-        A[i + 1, : i + 1] = row
-    power, coefficients = np.ones(stages), [1.0]
-    for _ in range(stages):
-        coefficients.append(float(np.asarray(tableau.b_sol) @ power))
-        power = A @ power
-    R = np.polynomial.Polynomial([c * (-1) ** k for k, c in enumerate(coefficients)])
-    roots = (R * R - 1).roots()
-    crossings = roots.real[(np.abs(roots.imag) < 1e-6) & (roots.real > 1e-3)]
-    return float(min(crossings, default=np.inf))

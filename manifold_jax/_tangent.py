@@ -5,7 +5,8 @@ from typing import Any
 
 import equinox as eqx
 
-from ._constraint import AbstractConstraint, check_constraint_type
+from ._constraint import AbstractConstraint
+from ._constraint_checks import check_constraint_type
 from ._custom_types import Args, RealScalarLike, Y
 from ._projection import NewtonProjection
 from ._stabilization import InvariantStabilization

@@ -9,17 +9,11 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array
 
-from ._constraint import (
-    AbstractConstraint,
-    check_constraint,
-    check_constraint_type,
-    check_state,
-    jacobian,
-    residual_vector,
-    row_scale,
-)
+from ._constraint import AbstractConstraint
+from ._constraint_checks import check_constraint, check_constraint_type, check_state
 from ._custom_types import Args, FloatScalar, Y
 from ._errors import clear_errors
+from ._residual import jacobian, residual_vector, row_scale
 
 
 @clear_errors

@@ -16,19 +16,22 @@ FILES = sorted(PACKAGE.rglob("*.py"))
 # Layers, lowest first; a file may import from its own layer or a lower one.
 LAYERS = [
     {"_custom_types", "_compat", "_errors", "_user_function"},
-    {"_linear", "_constraint"},
-    {"_violation", "_mechanics"},
-    {"_newton", "_diagnosis"},
-    {"_two_stage", "_projection_info"},
-    {"_projection"},
-    {"_chart", "_stabilization"},
-    {"_tangent", "_interpolation", "_initial"},
-    {"_solver"},
-    {"_adjoint", "_arguments", "_outcome"},
-    {"_output"},
-    {"_diffeqsolve"},
+    {"_linear", "_residual", "_projection", "_stability", "_directed_term"},
+    {"_newton"},
+    {"_correction"},
+    {"_projection_info"},
+    {"_constraint"},
+    {"_constraint_checks"},
+    {"_violation", "_diagnosis"},
+    {"_project"},
+    {"_chart", "_stabilization", "_interpolation"},
+    {"_tangent", "_solver"},
+    {"_adjoint"},
+    {"_solve"},
+    {"_mechanics"},
     {"_applications"},
     {"_fit"},
+    {"_manifolds", "_lie_groups"},
     {"problems"},
     {"__init__"},
     {"_compare"},
@@ -105,3 +108,24 @@ def test_every_public_name_has_a_docstring():
     assert len(public) >= 9
     for x in public:
         assert (x.__doc__ or "").strip(), x
+
+
+EXTENSIONS = [path for path in FILES if path.parent.name in ("_manifolds", "_lie_groups")]
+
+
+@pytest.mark.parametrize("path", EXTENSIONS, ids=lambda p: str(p.relative_to(PACKAGE)))
+def test_extensions_use_public_names_only(path):
+    """They come with the package, but could be anybody's."""
+    own = path.parent.name
+    assert all(module.split(".")[0] in ("__init__", own) for module in imports(path)), path
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Attribute) and getattr(node.value, "id", "") == "mj":
+            assert not node.attr.startswith("_")
+            assert hasattr(mj, node.attr)
+
+
+def test_the_core_knows_nothing_of_mechanics():
+    below = set().union(*LAYERS[: next(i for i, s in enumerate(LAYERS) if "_mechanics" in s)])
+    for path in FILES:
+        if path.relative_to(PACKAGE).parts[0].removesuffix(".py") in below:
+            assert not any(module.startswith("_mechanics") for module in imports(path)), path

@@ -107,8 +107,12 @@ def test_check_refuses_and_assume_trusts():
     adaptive = dfx.PIDController(rtol=1e-6, atol=1e-6)
     sol = solve(y0=off, consistent="assume", stepsize_controller=adaptive, max_steps=None)
     np.testing.assert_allclose(sol.ys[0] @ sol.ys[0], 1, atol=1e-15)
+
+
+@pytest.mark.usefixtures("as_a_user_meets_it")
+def test_consistent_is_one_of_three_words():
     with pytest.raises(ValueError, match="`consistent`.*'project', 'check' or 'assume'"):
-        mj._diffeqsolve._check_arguments(None, "maybe")
+        solve(consistent="maybe")
 
 
 def test_constraint_that_becomes_unsatisfiable():

@@ -79,7 +79,8 @@ def test_whole_numbers_as_times():
         1.0, lambda t, q, args: q @ q - t**2, lambda t, q, v, args: jnp.zeros(2)
     )
     y = jnp.array([1.2, 1.6]), jnp.array([0.3, 0.5])
-    for function in (mj.project, mj.consistent_state, mj.NewtonProjection()):
+    correct = lambda constraint, t, y: constraint.correct(mj.NewtonProjection(), t, y)
+    for function in (mj.project, mj.consistent_state, correct):
         whole, floating = (function(system.constraint, t, y)[0] for t in (2, 2.0))
         assert all(map(np.array_equal, whole, floating))
         np.testing.assert_allclose(whole[0], [1.2, 1.6], atol=1e-15)

@@ -68,7 +68,7 @@ def test_projection_costs_no_field_and_one_jacobian_per_step(solver, stages):
 
 
 def test_the_derivative_of_a_stage_is_computed_once(monkeypatch):
-    """XLA copies products into every kernel that needs them, but no division (`_kept`). If this
+    """XLA copies products into every kernel that needs them, but no division (`derivative_once`). If this
     fails as the counts are equal, the division is not needed any more."""
     problem = mj.problems.pendulum()
     solver = mj.Projected(dfx.Tsit5(), problem.constraint)
@@ -85,5 +85,5 @@ def test_the_derivative_of_a_stage_is_computed_once(monkeypatch):
         return (analysis[0] if isinstance(analysis, list) else analysis)["flops"]
 
     kept = operations()
-    monkeypatch.setattr(explicit, "_kept", lambda y, like: y)
+    monkeypatch.setattr(explicit, "derivative_once", lambda y, like: y)
     assert kept < 0.85 * operations()

@@ -31,7 +31,7 @@ def test_stale_first_same_as_last_stage(solver):
     y1, _, info, state, _ = projected.step(terms, 0.0, 3.0, y0, args, state, made_jump=False)
     fresh = terms.vf(3.0, y1, args)
     assert np.abs(info["correction"]).max() > 1e-8
-    np.testing.assert_allclose(state.inner, fresh, rtol=0, atol=1e-15)
+    np.testing.assert_allclose(state.memory, fresh, rtol=0, atol=1e-15)
 
 
 def test_stale_derivative_of_a_solver_with_its_own_stages():

@@ -89,7 +89,7 @@ class _LastStep:
         if not (isinstance(solver, AbstractManifoldSolver) and solver.corrects_output):
             return y, True
         time = t * time_direction(self.given["terms"])
-        y, info = solver.projection(solver.constraint, time, y, self.args)
+        y, info = solver.correct(time, y, self.args)
         return y, info.success
 
     def _values(self, t: FloatScalar) -> Float[Array, " events"]:

@@ -14,7 +14,8 @@ from jaxtyping import Array
 from .._custom_types import Args, RealScalarLike, Y
 from .._projection_info import ProjectionInfo
 from .._solver.advance import HookState
-from .._solver.explicit import explicit_step, is_unrollable
+from .._solver.execution import execution_of, WrittenOut
+from .._solver.frame import Frame
 
 
 class State(NamedTuple):
@@ -87,7 +88,8 @@ class Solve(NamedTuple):
     def of(terms: Any, solver: Any, args: Args, init_state: Any, controller: Any) -> "Solve":
         times = init_state.tprev, init_state.tnext
         # The step of a solver of Diffrax itself is written out, and then remembers nothing.
-        written_out = is_unrollable(solver, terms, *times, init_state.y, args)
+        execution = execution_of(solver, terms, *times, init_state.y, args)
+        written_out = isinstance(execution, WrittenOut)
         jumps = may_jump(controller, init_state.made_jump)
         solver_state = lax.stop_gradient(init_state.solver_state)
         return Solve(terms, solver, args, solver_state, not written_out, jumps)
@@ -102,11 +104,9 @@ class Solve(NamedTuple):
         terms, solver, args, y = self.terms, self.solver, self.args, state.y
         if not self.remembers:
             unchanged = lambda y: (y, ProjectionInfo.of_nothing(y, jnp.asarray(True)))
-            f0, tableau = terms.vf(start, y, args), solver.tableau  # pyright: ignore
-            y1, _, _, dense_info, _, _ = explicit_step(
-                tableau, terms, terms, start, end, y, args, f0, unchanged
-            )
-            return State(y1, None), dense_info
+            frame = Frame.of_state(y, terms, unchanged)
+            step = WrittenOut(solver).step(terms, frame, start, end, y, args, None, False)
+            return State(step.y1, None), step.dense_info
         solver_state = with_memory(self.solver_state, state.memory)
         y1, _, dense_info, solver_state, _ = solver.step(
             terms, start, end, y, args, solver_state, jumped
@@ -116,12 +116,12 @@ class Solve(NamedTuple):
 
 def memory_of(solver_state: Any) -> Any:
     """Of a hook without its statistics, which no step depends on."""
-    return solver_state.inner if isinstance(solver_state, HookState) else solver_state
+    return solver_state.memory if isinstance(solver_state, HookState) else solver_state
 
 
 def with_memory(solver_state: Any, memory: Any) -> Any:
     if isinstance(solver_state, HookState):
-        return dataclasses.replace(solver_state, inner=memory)
+        return dataclasses.replace(solver_state, memory=memory)
     return memory
 
 

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 
 from .._adjoint import StepReplayAdjoint
 from .._compat import nonlinear_failure
-from .._constraint import check_state
+from .._constraint_checks import check_state
 from .._custom_types import Args, IntScalar, RealScalarLike
 from .._errors import clear_errors
 from .checks import as_curve_start, as_direction, check_counts, check_function, raise_if_failed

@@ -9,13 +9,15 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from .._constraint import Constraint, jacobian
+from .._constraint import Constraint
 from .._custom_types import Args, BoolScalar, FloatScalar, IntScalar, RealScalarLike
-from .._diffeqsolve import diffeqsolve
-from .._initial import consistent_state
-from .._projection import ProjectionInfo
+from .._linear import Elimination, reduction
+from .._newton import without_derivative
+from .._project import consistent_state
+from .._projection_info import ProjectionInfo
+from .._residual import jacobian
+from .._solve import diffeqsolve
 from .._solver import Projected
-from .roots import reduction, solve, without_derivative
 
 
 # A straight piece has no error that limits the steps, and a step that leaps over two
@@ -38,7 +40,8 @@ def _kernel_derivative(primals, tangents):
     """`G dtau = -dG tau`, `tau . dtau = 0`."""
     (G,), (dG,) = primals, tangents
     tau = kernel(G)
-    return tau, solve(jnp.concatenate([G, tau[None]]), jnp.append(-dG @ tau, 0 * tau[:1]))
+    system = Elimination(jnp.concatenate([G, tau[None]]))
+    return tau, system.solve(jnp.append(-dG @ tau, 0 * tau[:1]))
 
 
 class Curve(eqx.Module):

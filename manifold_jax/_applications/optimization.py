@@ -13,21 +13,16 @@ from diffrax import RESULTS
 from jaxtyping import Array, Bool, Float
 
 from .._compat import is_okay, nonlinear_failure
-from .._constraint import (
-    AbstractConstraint,
-    check_constraint,
-    check_state,
-    Constraint,
-    residual_vector,
-    row_scale,
-)
+from .._constraint import AbstractConstraint, Constraint
+from .._constraint_checks import check_constraint, check_state
 from .._custom_types import Args, BoolScalar, FloatScalar, RealScalarLike, Y
-from .._diffeqsolve import diffeqsolve
 from .._errors import clear_errors
+from .._newton import without_derivative
 from .._projection import NewtonProjection
+from .._residual import residual_vector, row_scale
+from .._solve import diffeqsolve
 from .._solver import Projected
 from .checks import check_function, raise_if_failed
-from .roots import without_derivative
 from .stationary import Lagrangian, stationary_point
 
 

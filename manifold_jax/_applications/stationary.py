@@ -8,10 +8,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._constraint import jacobian, row_scale
 from .._custom_types import Args, BoolScalar, FloatScalar
-from .._linear import Factorization, factorize, gram
-from .roots import implicit_root, newton, solve, without_derivative
+from .._linear import Elimination, Factorization, factorize, gram
+from .._newton import AbstractEquations, find_root, implicit_root, without_derivative
+from .._residual import jacobian, row_scale
 
 
 class Lagrangian(eqx.Module):
@@ -77,15 +77,21 @@ class StationaryPoint(NamedTuple):
     is_minimum: BoolScalar
 
 
-class _Conditions(eqx.Module):
+class _Conditions(AbstractEquations):
     """`grad f + G^T lambda = 0` and `g = 0`, each row divided by its typical size."""
 
     lagrangian: Lagrangian
     sizes: Float[Array, " n_plus_m"]
     n: int = eqx.field(static=True)
 
-    def __call__(self, point: Float[Array, " n_plus_m"]) -> Float[Array, " n_plus_m"]:
-        x, multipliers = point[: self.n], point[self.n :]
+    def point(self, z: Float[Array, " n_plus_m"]) -> Float[Array, " n_plus_m"]:
+        return z
+
+    def linearize(self, x: Float[Array, " n_plus_m"]) -> Elimination:
+        return Elimination(jax.jacfwd(self.residual)(x))
+
+    def residual(self, x: Float[Array, " n_plus_m"]) -> Float[Array, " n_plus_m"]:
+        x, multipliers = x[: self.n], x[self.n :]
         slopes = jax.grad(self.lagrangian)(x, multipliers)
         return jnp.concatenate([slopes, self.lagrangian.g(x)]) / self.sizes
 
@@ -113,12 +119,12 @@ def stationary_point(
     row_sizes = row_scale(fixed.normals(near)[0], near)
     sizes = jnp.concatenate([jnp.broadcast_to(size, near.shape), row_sizes])
     conditions = _Conditions(fixed, sizes, n)
-    root = newton(conditions, guess)
+    root = find_root(conditions, guess)
     moved = jnp.max(jnp.abs(root[:n] - near) / (jnp.abs(near) + 1))
     point = jnp.where(moved <= reach, root, guess)
     point = implicit_root(_Conditions(lagrangian, sizes, n), point)
 
-    beyond = guess - 2 * solve(jax.jacfwd(conditions)(guess), conditions(guess))
+    beyond = guess - 2 * conditions.linearize(guess).solve(conditions.residual(guess))
     points = jnp.stack([point, guess, beyond])
     curvatures, bends = jax.vmap(lambda p: lagrangian.curvature(p[:n], p[n:]))(points)
     rounding = 100 * n * jnp.finfo(near.dtype).eps * bends[0]

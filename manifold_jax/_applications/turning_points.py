@@ -9,8 +9,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from .._custom_types import FloatScalar, IntScalar
+from .._newton import without_derivative
 from .following import Curve, Nodes
-from .roots import without_derivative
 
 
 class Turns(NamedTuple):

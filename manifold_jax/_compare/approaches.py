@@ -8,9 +8,9 @@ import diffrax as dfx
 import equinox as eqx
 
 from .._chart import CoordinatePartitionChart, TangentSpaceChart
-from .._diffeqsolve import diffeqsolve
 from .._mechanics import Baumgarte
 from .._projection import NewtonProjection
+from .._solve import diffeqsolve
 from .._solver import LocalCoordinates, Projected, Stabilized
 from .._stabilization import ExactStabilization, InvariantStabilization
 from ..problems import Problem

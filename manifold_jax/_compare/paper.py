@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from rich.table import Table
 
-from .._diffeqsolve import diffeqsolve
+from .._solve import diffeqsolve
 from .._solver import Projected
 from ..problems import harmonic_oscillator
 

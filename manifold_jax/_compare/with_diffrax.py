@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._diffeqsolve import diffeqsolve
+from .._solve import diffeqsolve
 from .approaches import Approach, Formulation, with_vector_field
 from .task import as_rows, Run, SolveFailed, Task
 from .timing import median_ms

@@ -12,10 +12,11 @@ import jax.tree_util as jtu
 from jaxtyping import Array, Float
 
 from .._compat import is_okay
-from .._constraint import AbstractConstraint, check_state, Invariants
+from .._constraint import AbstractConstraint, Invariants
+from .._constraint_checks import check_state
 from .._custom_types import Args, BoolScalar, FloatScalar, IntScalar, Y
-from .._diffeqsolve import diffeqsolve
 from .._mechanics import MechanicalSystem
+from .._solve import diffeqsolve
 from .._solver import Projected
 from .._solver.base import AbstractManifoldSolver
 from .parameters import Transform

@@ -7,21 +7,35 @@ import equinox as eqx
 import jax
 import jax.flatten_util as jfu
 import jax.numpy as jnp
-import jax.tree_util as jtu
 from jaxtyping import Array, Float
 
-from .._constraint import AbstractConstraint, jacobian
+from .._constraint import AbstractConstraint
+from .._correction import Normals, without_normal_part
 from .._custom_types import Args, BoolScalar, RealScalarLike, Y
-from .mass import factorize_mass, Mass, mass_values
+from .._linear import multiply
+from .._projection import NewtonProjection
+from .._projection_info import ProjectionInfo
+from .._residual import as_time
+from .correction import InverseMetrics, TwoStages
+from .kinematics import Kinematics
+
+
+_ASYMMETRIC = (
+    "`mass_matrix` is not symmetric at `{y}`. Return `(M + M.T) / 2`, or check its formula."
+)
+_NOT_POSITIVE = (
+    "`mass_matrix` is not positive definite at `{y}` (a matrix may be singular, but not for motions that the "
+    "constraints allow; a scalar or a diagonal must be positive). Check its signs and that no mass is missing."
+)
 
 
 class MechanicalConstraint(AbstractConstraint):
-    r"""The constraints of a [`MechanicalSystem`][] on its state `(q, v)`:
+    r"""The constraints of a [`MechanicalSystem`][] on its state `(q, v)`, `k` numbers each:
     `phi(t, q) = 0`, `J v + dphi/dt = 0` with `J = dphi/dq`, and `a(t, q, v) = 0`.
 
     Built by `MechanicalSystem.constraint`. Corrections use its structure: first the positions,
     then the velocities, which is a linear problem, with the same matrix. The derivative of
-    `J v` is never formed.
+    `J v` is never formed. Normals are those of the velocities.
     """
 
     holonomic: Callable | None
@@ -30,91 +44,55 @@ class MechanicalConstraint(AbstractConstraint):
     redundant: bool = eqx.field(static=True)
 
     def __call__(self, t: RealScalarLike, y: Y, args: Args = None) -> Any:
-        equations = Kinematics(self, y)
+        equations = Kinematics.of(self, y)
         x, w = equations.flat(y)
         t = jnp.asarray(t, x.dtype)
         return equations.position(t, x, args), equations.velocity(t, w, (x, args))
 
-    def check_mass(self, t: RealScalarLike, y: Y, args: Args) -> tuple[BoolScalar, BoolScalar]:
-        """Whether the mass matrix is symmetric, and positive definite as far as it must be."""
-        equations = Kinematics(self, y)
+    def correct(
+        self, projection, t, y, args=None, *, fallback=None, far=False, directions=None
+    ) -> tuple[Y, ProjectionInfo]:
+        fallback = y if fallback is None else fallback
+        x, _ = jfu.ravel_pytree(y)
+        stages = self._stages(projection, t, y, args, directions)
+        corrected, roots = stages.correct(y, fallback, far)
+        return corrected, ProjectionInfo.of_correction(x, *roots)
+
+    def normals(self, projection, t, y, args=None) -> Normals:
+        stages = self._stages(projection, t, y, args, None)
+        return stages.normals(*stages.equations.flat(y)).normals
+
+    def push_forward(self, t, y, args, directions, vector) -> Y:
+        """Positions first; the velocities depend on them."""
+        equations = Kinematics.of(self, y)
         x, w = equations.flat(y)
-        t = jnp.asarray(t, x.dtype)
+        e_x, e_w = equations.flat(vector)
+        t = as_time(t, x.dtype)
+        C, p = equations.rows(t, x, w, args)
+        if p > 0:
+            positions = Normals(C[:p], directions[:p])
+            e_x = without_normal_part(positions, e_x, multiply(C[:p], e_x), self.redundant)
+        velocity = lambda x, w: equations.velocity(t, w, (x, args))
+        _, rate = jax.jvp(velocity, (x, w), (e_x, e_w))
+        e_w = without_normal_part(Normals(C, directions), e_w, rate, self.redundant)
+        return equations.unravel(e_x), equations.unravel(e_w)
+
+    def faults(self, t, y, args=None) -> tuple[tuple[BoolScalar, str], ...]:
+        equations = Kinematics.of(self, y)
+        x, w = equations.flat(y)
+        t = as_time(t, x.dtype)
         mass = equations.mass(t, x, w, args, equations.rows(t, x, w, args)[0])
-        return mass.symmetric, mass.positive
+        return (~mass.positive, _NOT_POSITIVE), (~mass.symmetric, _ASYMMETRIC)
 
-
-class Kinematics:
-    """The constraints as functions of vectors, `x` for positions and `w` for velocities."""
-
-    def __init__(self, constraint: MechanicalConstraint, y: Y):
-        q, _ = check_mechanical_state(y)
-        _, self.unravel = jfu.ravel_pytree(q)
-        self.constraint = constraint
-
-    def flat(self, y: Y) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
-        q, v = y
-        return jfu.ravel_pytree(q)[0], jfu.ravel_pytree(v)[0]
-
-    def position(self, t: Array, x: Float[Array, " n"], args: Args) -> Float[Array, " p"]:
-        if self.constraint.holonomic is None:
-            return jnp.zeros((0,), x.dtype)
-        return jfu.ravel_pytree(self.constraint.holonomic(t, self.unravel(x), args))[0]
-
-    def velocity(
-        self, t: Array, w: Float[Array, " n"], context: tuple[Float[Array, " n"], Args]
-    ) -> Float[Array, " m"]:
-        """Residual of the velocities at the positions in `context`."""
-        x, args = context
-        position = lambda t, x: self.position(t, x, args)
-        _, rate = jax.jvp(position, (t, x), (jnp.ones_like(t), w))
-        if self.constraint.nonholonomic is None:
-            return rate
-        extra = self.constraint.nonholonomic(t, self.unravel(x), self.unravel(w), args)
-        return jnp.concatenate([rate, jfu.ravel_pytree(extra)[0]])
-
-    def rows(
-        self, t: Array, x: Float[Array, " n"], w: Float[Array, " n"], args: Args
-    ) -> tuple[Float[Array, "m n"], int]:
-        """`C = [J; da/dv]`, and how many of the rows belong to positions."""
-        _, J = jacobian(lambda x: self.position(t, x, args), x)
-        if self.constraint.nonholonomic is None:
-            return J, J.shape[0]
-        nonholonomic = lambda w: self.velocity(t, w, (x, args))[J.shape[0] :]
-        return jnp.concatenate([J, jacobian(nonholonomic, w)[1]]), J.shape[0]
-
-    def acceleration_bias(
-        self, t: Array, x: Float[Array, " n"], w: Float[Array, " n"], args: Args
-    ) -> Float[Array, " m"]:
-        """What the second derivative of the constraints is at zero acceleration."""
-        velocity = lambda t, x: self.velocity(t, w, (x, args))
-        return jax.jvp(velocity, (t, x), (jnp.ones_like(t), w))[1]
-
-    def mass(
+    def _stages(
         self,
-        t: Array,
-        x: Float[Array, " n"],
-        w: Float[Array, " n"],
+        projection: NewtonProjection,
+        t: RealScalarLike,
+        y: Y,
         args: Args,
-        C: Float[Array, "m n"],
-    ) -> Mass:
-        q, v = self.unravel(x), self.unravel(w)
-        values = mass_values(self.constraint.mass_matrix(t, q, v, args), q)
-        return factorize_mass(values, C)
-
-
-def check_mechanical_state(y: Y) -> tuple[Any, Any]:
-    """Refuse, while tracing, states that are not `(q, v)`."""
-    if not (isinstance(y, tuple) and len(y) == 2):
-        raise ValueError(
-            "`y` must be the tuple `(q, v)` of positions and velocities of a mechanical system, got "
-            f"{type(y).__name__}. Write e.g. `y0 = (q0, jnp.zeros_like(q0))`."
-        )
-    q, v = y
-    shapes = lambda tree: jtu.tree_map(jnp.shape, tree)
-    if jtu.tree_structure(q) != jtu.tree_structure(v) or shapes(q) != shapes(v):
-        raise ValueError(
-            f"`y` = (q, v) must have velocities of the same structure and shapes as the positions, v = dq/dt, got "
-            f"{shapes(q)} and {shapes(v)}."
-        )
-    return q, v
+        directions: Float[Array, "m k"] | None,
+    ) -> TwoStages:
+        equations = Kinematics.of(self, y)
+        metrics = InverseMetrics.of(projection, y)
+        t = as_time(t, jnp.result_type(*jax.tree_util.tree_leaves(y)))
+        return TwoStages(equations, t, args, projection, metrics, directions, self.redundant)

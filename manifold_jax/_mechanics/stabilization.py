@@ -4,6 +4,7 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from .._custom_types import FloatScalar, RealScalarLike
+from .._stability import refuse_negative
 
 
 class Baumgarte(eqx.Module):
@@ -49,11 +50,3 @@ class VelocityStabilization(eqx.Module):
 
     Source: Gear, Gupta & Leimkuhler, J. Comput. Appl. Math. 12/13 (1985) 77-90.
     """
-
-
-def refuse_negative(name: str, gain: RealScalarLike) -> None:
-    if isinstance(gain, int | float) and not gain >= 0:
-        raise ValueError(
-            f"`{name}` must not be negative, got {gain}: violations would grow instead of decay. "
-            "Integrating backwards needs no change of sign."
-        )

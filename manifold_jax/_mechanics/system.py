@@ -11,13 +11,14 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._custom_types import Args, RealScalarLike, Y
+from .._directed_term import DirectedTerm
 from .._linear import combine, factorize, gram, gram_written_out, multiply
 from .._user_function import check_function
-from .constraint import check_mechanical_state, Kinematics, MechanicalConstraint
+from .constraint import MechanicalConstraint
+from .kinematics import check_mechanical_state, Kinematics
 from .lagrangian import LagrangianForce
 from .mass import ConfigurationMass, LagrangianMass, Mass
 from .stabilization import Baumgarte, VelocityStabilization
-from .term import DirectedTerm
 
 
 class MechanicalSystem(eqx.Module):
@@ -177,7 +178,7 @@ class _Motion:
 
     def __init__(self, system: MechanicalSystem, t: RealScalarLike, y: Y, args: Args):
         q, v = check_mechanical_state(y)
-        self.equations = Kinematics(system.constraint, y)
+        self.equations = Kinematics.of(system, y)
         self.unravel = self.equations.unravel
         self.x, self.w = self.equations.flat(y)
         self.t, self.args = jnp.asarray(t, self.x.dtype), args

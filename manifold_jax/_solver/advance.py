@@ -1,10 +1,8 @@
-"""What the step hooks have in common: one step of the wrapped solver, and the verdict on it."""
+"""What the step hooks have in common: what they carry from step to step, and the verdict on a step."""
 
 import functools
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
-import diffrax as dfx
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -13,10 +11,9 @@ from diffrax import RESULTS
 from jaxtyping import Array
 
 from .._compat import is_okay, nonlinear_failure, update_result
-from .._custom_types import Args, BoolScalar, FloatScalar, IntScalar, RealScalarLike, Y
+from .._custom_types import BoolScalar, FloatScalar, IntScalar, RealScalarLike, Y
 from .._projection_info import ProjectionInfo
-from .explicit import explicit_step, is_first_same_as_last, is_unrollable, refreshed
-from .implicit import carries_derivative, step_with_derivative
+from .execution import Step
 
 
 class StepStatistics(eqx.Module):
@@ -58,97 +55,36 @@ def _distance(y0: Y, y1: Y, dtype: Any) -> FloatScalar:
 
 
 class HookState(eqx.Module):
-    """Carried from step to step: the wrapped solver's own state, the size of the first step
+    """Carried from step to step: what the execution of steps remembers, the size of the first step
     that was tried (the scale of time near t = 0), the totals, and how the last step went."""
 
-    inner: Any
+    memory: Any
     first_step: FloatScalar
     statistics: StepStatistics
     result: RESULTS
 
-
-class Step(NamedTuple):
-    """One attempted step: the state before it, after it, corrected and `raw`, and what the wrapped
-    solver returned."""
-
-    y0: Y
-    y1: Y
-    raw: Y
-    error: Y | None
-    dense_info: dict[str, Any]
-    inner_state: Any
-    result: RESULTS
-    info: ProjectionInfo
-
-
-def initial_state(
-    inner: dfx.AbstractSolver, terms: Any, t0: RealScalarLike, t1: RealScalarLike, y0: Y, args: Args
-) -> HookState:
-    if is_unrollable(inner, terms, t0, t1, y0, args):
-        fsal = is_first_same_as_last(inner.tableau)  # pyright: ignore
-        inner_state = terms.vf(t0, y0, args) if fsal else None
-    elif carries_derivative(inner, terms, t0, t1, y0, args):
-        inner_state = inner.func(terms, t0, y0, args)
-    else:
-        inner_state = inner.init(terms, t0, t1, y0, args)
-    first_step = jnp.abs(jnp.asarray(t1) - t0)
-    return HookState(inner_state, first_step, StepStatistics.zero(y0), RESULTS.successful)
-
-
-def advance(
-    inner: dfx.AbstractSolver,
-    terms: Any,
-    stage_terms: Any,
-    t0: RealScalarLike,
-    t1: RealScalarLike,
-    y0: Y,
-    args: Args,
-    inner_state: Any,
-    made_jump: Any,
-    correct: Callable[[Y], tuple[Y, ProjectionInfo]],
-) -> Step:
-    """One step of `inner`, its end corrected. `stage_terms` are `terms` as seen by the stages,
-    which are not corrected; both agree on corrected states."""
-    if is_unrollable(inner, terms, t0, t1, y0, args):
-        tableau = inner.tableau  # pyright: ignore
-        fsal = is_first_same_as_last(tableau)
-        evaluate = lambda: terms.vf(t0, y0, args)
-        f0 = refreshed(made_jump, inner_state, evaluate) if fsal else evaluate()
-        y1, raw, error, dense_info, f1, info = explicit_step(
-            tableau, terms, stage_terms, t0, t1, y0, args, f0, correct
-        )
-        return Step(y0, y1, raw, error, dense_info, f1 if fsal else None, RESULTS.successful, info)
-    if carries_derivative(inner, terms, t0, t1, y0, args):
-        raw, error, dense_info, inner_state, result = step_with_derivative(
-            inner, terms, stage_terms, t0, t1, y0, args, inner_state, made_jump
-        )
-    else:
-        # What a solver carried over belongs to the uncorrected state. Diffrax evaluates it anew
-        # if any lane of a batch needs it, so that keeping it would make the lanes depend on each
-        # other; always evaluating it does not.
-        raw, error, dense_info, inner_state, result = inner.step(
-            stage_terms, t0, t1, y0, args, inner_state, made_jump=True
-        )
-    y1, info = correct(raw)
-    return Step(y0, y1, raw, error, dense_info, inner_state, result, info)
+    @staticmethod
+    def initial(memory: Any, t0: RealScalarLike, t1: RealScalarLike, y0: Y) -> "HookState":
+        first_step = jnp.abs(jnp.asarray(t1) - t0)
+        return HookState(memory, first_step, StepStatistics.zero(y0), RESULTS.successful)
 
 
 def conclude(
-    step: Step, t0: RealScalarLike, t1: RealScalarLike, state: HookState, raise_error: bool
+    step: Step, t0: RealScalarLike, t1: RealScalarLike, state: HookState, bounds_error: bool
 ) -> tuple[Y, Y | None, dict[str, Any], HookState, RESULTS]:
     """What a solver's `step` returns. A step that could not be corrected is to be rejected; with
-    `raise_error` the error estimate is at least the size of the correction."""
+    `bounds_error` the error estimate is at least the size of the correction."""
     corrected = RESULTS.where(step.info.success, RESULTS.successful, nonlinear_failure())
     result, error = update_result(step.result, corrected), step.error
     if error is not None:
         repeatable = is_repeatable(t0, t1, state.first_step)
-        if raise_error:
+        if bounds_error:
             error = _at_least(error, step.raw, step.y1, repeatable)
         error = rejecting(error, is_okay(result), repeatable)
     correction = jtu.tree_map(jnp.subtract, step.y1, step.raw)
     dense_info = dict(corrected=step.y1, correction=correction, **step.dense_info)
     statistics = state.statistics.including(step.y0, step.y1, step.info)
-    state = HookState(step.inner_state, state.first_step, statistics, result)
+    state = HookState(step.memory, state.first_step, statistics, result)
     return step.y1, error, dense_info, state, result
 
 

@@ -1,14 +1,17 @@
 """What every step hook shares: forwarding to the solver it is wrapped around."""
 
+import dataclasses
 from typing import Any
 
 import diffrax as dfx
 import equinox as eqx
 
 from .._compat import is_sde
-from .._constraint import AbstractConstraint, check_constraint_type
+from .._constraint import AbstractConstraint
+from .._constraint_checks import check_constraint_type
 from .._custom_types import Args, RealScalarLike, Y
 from .._projection import NewtonProjection
+from .._projection_info import ProjectionInfo
 
 
 # One-step methods that keep no past values of y. Others (leapfrog, reversible) carry a
@@ -35,8 +38,36 @@ class AbstractManifoldSolver(dfx.AbstractWrappedSolver):
     inner: eqx.AbstractVar[dfx.AbstractSolver]
     constraint: eqx.AbstractVar[AbstractConstraint]
     projection: eqx.AbstractVar[NewtonProjection]  # also corrects what is handed out
-    bend_interpolant: eqx.AbstractVar[bool]  # to end at the corrected state
     corrects_output: eqx.AbstractVar[bool]  # whether what is handed out is corrected
+    # Whether interpolants are bent to end at the corrected state. Not where every interpolated value
+    # is corrected afterwards, which makes them continuous by itself: the same correction of the same
+    # point. Bending costs more than interpolating.
+    bends_interpolant: eqx.AbstractVar[bool]
+    # Whether the error estimate of a step is at least the size of its correction, which is a lower
+    # bound of the local error (Sudarsan & Keerthi 1998, 3.4).
+    bounds_error: eqx.AbstractVar[bool]
+
+    def within(
+        self, controller: dfx.AbstractStepSizeController, bends_interpolant: bool
+    ) -> "AbstractManifoldSolver":
+        """The solver as `mj.diffeqsolve` runs it: with the tolerances of the step size controller,
+        which it cannot see by itself, unless it has others. Errors are bounded if there are any."""
+        tolerances = controller_tolerances(controller)
+        projection = self.projection
+        if tolerances is not None and projection.rtol is None:
+            rtol, atol = tolerances.rtol, tolerances.atol
+            projection = dataclasses.replace(projection, rtol=rtol, atol=atol)
+        return eqx.tree_at(
+            lambda s: (s.projection, s.bends_interpolant, s.bounds_error),
+            self,
+            (projection, bends_interpolant, tolerances is not None),
+        )
+
+    def correct(
+        self, t: RealScalarLike, y: Y, args: Args, fallback: Y | None = None
+    ) -> tuple[Y, ProjectionInfo]:
+        """A state on the manifold, at the true time `t`."""
+        return self.constraint.correct(self.projection, t, y, args, fallback=fallback)
 
     @property
     def solver(self) -> dfx.AbstractSolver:  # pyright: ignore
@@ -75,6 +106,13 @@ class AbstractManifoldSolver(dfx.AbstractWrappedSolver):
 
     def func(self, terms, t0: RealScalarLike, y0: Y, args: Args) -> Any:
         return self.inner.func(terms, t0, y0, args)
+
+
+def controller_tolerances(controller: Any) -> dfx.PIDController | None:
+    """The controller that holds `rtol`, `atol` and `norm`, inside any wrappers around it."""
+    while hasattr(controller, "controller"):
+        controller = controller.controller
+    return controller if isinstance(controller, dfx.PIDController) else None
 
 
 def check_hook_arguments(solver: Any, constraint: Any, hook: str) -> None:

@@ -1,4 +1,4 @@
-"""One explicit Runge-Kutta step, written out stage by stage.
+"""One explicit Runge-Kutta step, written out stage by stage or in a loop over the stages.
 
 Diffrax runs the stages in a loop with dynamic buffers. Writing them out lets XLA fuse a
 whole step of a small system, and lets the new state be corrected *before* the last stage
@@ -7,7 +7,7 @@ belongs to the corrected state at no cost.
 """
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import diffrax as dfx
 import jax
@@ -20,6 +20,7 @@ from jaxtyping import Array
 
 from .._custom_types import Args, RealScalarLike, Y
 from .._projection_info import ProjectionInfo
+from .frame import Frame
 
 
 # Equations of the vector field times stages. With up to 210 (rigid body) a loop over the stages takes
@@ -49,67 +50,77 @@ def is_first_same_as_last(tableau: dfx.ButcherTableau) -> bool:
     return tableau.fsal and tableau.ssal
 
 
+class ExplicitStep(NamedTuple):
+    """The state at the end, the coordinates there, the embedded error estimate (of coordinates),
+    the data of the solver's own interpolation, the vector field of the last stage, and how the
+    correction went."""
+
+    y1: Y
+    w1: Y
+    error: Y
+    dense_info: dict[str, Any]
+    f1: Any
+    info: ProjectionInfo
+
+
 def explicit_step(
     tableau: dfx.ButcherTableau,
     terms: AbstractTerm,
-    stage_terms: AbstractTerm,
+    frame: Frame,
     t0: RealScalarLike,
     t1: RealScalarLike,
     y0: Y,
     args: Args,
     f0: Any,
-    correct: Callable[[Y], tuple[Y, ProjectionInfo]],
-) -> tuple[Y, Y, Y, dict[str, Any], Any, ProjectionInfo]:
+    in_a_loop: bool | None = None,
+) -> ExplicitStep:
     """Step from `y0`, with `f0` the vector field there, and correct the result.
 
-    `stage_terms` are evaluated at the stages, `terms` at corrected states.
-
-    **Returns:**
-
-    The corrected state, the uncorrected one, the embedded error estimate, the data of the
-    solver's own interpolation, the vector field of the last stage, and what `correct`
-    returned besides the state.
+    `frame.terms` are evaluated at the stages, `terms` at states on the manifold. Stages are
+    evaluated in a loop if that is the faster way, unless told otherwise.
     """
     control = terms.contr(t0, t1)
     # Traced once, not once per stage.
     at_corrected = jax.jit(lambda t, y: terms.vf(t, y, args))
-    at_stage = jax.jit(lambda t, y: stage_terms.vf(t, y, args))
-    if stage_terms is terms:
+    at_stage = jax.jit(lambda t, w: frame.terms.vf(t, w, args))
+    if frame.terms is terms:
         at_stage = at_corrected
     fsal = is_first_same_as_last(tableau)
     rows = list(tableau.a_lower)
     # Not beyond `t1` by rounding, where the field may have jumped.
     times = [jnp.asarray(t1 if c == 1 else t0 + float(c) * (t1 - t0)) for c in tableau.c]
-    f, first = f0, terms.prod(f0, control)
+    w0, first = frame.origin, frame.pull_back(t0, frame.origin, y0, terms.prod(f0, control))
     inner_rows = rows[:-1] if fsal else rows
-    increment = lambda t, y: terms.prod(at_stage(t, y), control)
-    size = num_equations(jax.make_jaxpr(at_stage)(jnp.asarray(t0), y0).jaxpr) * (
-        len(inner_rows) + 1
-    )
-    evaluate = _stages if size <= LARGEST_UNROLLED or not inner_rows else _stages_in_a_loop
-    increments = evaluate(inner_rows, times[: len(inner_rows)], increment, y0, first)
+    increment = lambda t, w: frame.terms.prod(at_stage(t, w), control)
+    if in_a_loop is None:
+        length = num_equations(jax.make_jaxpr(at_stage)(jnp.asarray(t0), w0).jaxpr)
+        in_a_loop = length * (len(inner_rows) + 1) > LARGEST_UNROLLED and bool(inner_rows)
+    evaluate = _stages_in_a_loop if in_a_loop else _stages
+    increments = evaluate(inner_rows, times[: len(inner_rows)], increment, w0, first)
     # The last stage of a first-same-as-last method is taken at the new state itself.
-    raw = _kept(_combine(rows[-1] if fsal else tableau.b_sol, increments, y0), y0)
-    y1, info = correct(raw)
+    w1 = derivative_once(_combine(rows[-1] if fsal else tableau.b_sol, increments, w0), w0)
+    y1, info = frame.correct(w1)
+    f1 = None
     if fsal:
         # A failed step may end in NaN, of which the derivative would be NaN, not zero.
         safe = lambda a, b: jnp.where(info.success, a, jax.lax.stop_gradient(b))
-        f = at_corrected(jnp.asarray(t1), jtu.tree_map(safe, y1, y0))
-        increments.append(terms.prod(f, control))
+        end, at_end = jnp.asarray(t1), jtu.tree_map(safe, y1, y0)
+        f1 = at_corrected(end, at_end)
+        increments.append(frame.pull_back(end, w1, at_end, terms.prod(f1, control)))
     error = _combine(tableau.b_error, increments)
     k = jtu.tree_map(lambda *ks: jnp.stack(ks), *increments)
-    return y1, raw, error, dict(y0=y0, y1=raw, k=k), f, info
+    return ExplicitStep(y1, w1, error, dict(y0=w0, y1=w1, k=k), f1, info)
 
 
-def _stages(rows: list[Any], times: list[Array], increment: Callable, y0: Y, first: Y) -> list[Y]:
+def _stages(rows: list[Any], times: list[Array], increment: Callable, w0: Y, first: Y) -> list[Y]:
     increments = [first]
     for row, t in zip(rows, times, strict=True):
-        increments.append(increment(t, _kept(_combine(row, increments, y0), y0)))
+        increments.append(increment(t, derivative_once(_combine(row, increments, w0), w0)))
     return increments
 
 
 def _stages_in_a_loop(
-    rows: list[Any], times: list[Array], increment: Callable, y0: Y, first: Y
+    rows: list[Any], times: list[Array], increment: Callable, w0: Y, first: Y
 ) -> list[Y]:
     """The same with the vector field compiled once, whatever the number of stages."""
     count = len(rows) + 1
@@ -118,8 +129,8 @@ def _stages_in_a_loop(
 
     def stage(buffer: Y, xs: Any) -> tuple[Y, None]:
         i, t, row = xs
-        sum_up = lambda k, y: y + jnp.tensordot(row.astype(k.dtype), k, axes=1)
-        new = increment(t, jtu.tree_map(sum_up, buffer, y0))
+        sum_up = lambda k, w: w + jnp.tensordot(row.astype(k.dtype), k, axes=1)
+        new = increment(t, jtu.tree_map(sum_up, buffer, w0))
         return jtu.tree_map(lambda k, n: k.at[i].set(n), buffer, new), None
 
     xs = jnp.arange(1, count), jnp.stack(times), jnp.asarray(np.stack(padded))
@@ -139,7 +150,7 @@ def num_equations(jaxpr: Any) -> int:
 
 
 @jax.custom_jvp
-def _kept(y: Y, like: Y) -> Y:
+def derivative_once(y: Y, like: Y) -> Y:
     """`y`, with a derivative that is computed once. `like` is any known state.
 
     XLA for CPUs copies sums and products into every kernel that needs them, here the chain of all
@@ -151,7 +162,7 @@ def _kept(y: Y, like: Y) -> Y:
     return y
 
 
-@_kept.defjvp
+@derivative_once.defjvp
 def _derivative(primals: tuple[Y, Y], tangents: tuple[Y, Y]) -> tuple[Y, Y]:
     (y, like), (y_dot, _) = primals, tangents
     like = jax.lax.stop_gradient(like)

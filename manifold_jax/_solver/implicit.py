@@ -10,6 +10,7 @@ import optimistix as optx
 
 from .._custom_types import Args, BoolScalar, FloatScalar, RealScalarLike, Y
 from .explicit import refreshed
+from .frame import Frame
 
 
 # The most iterations, one less than Diffrax allows. A stage that is still not at round-off is that
@@ -115,7 +116,7 @@ def _tableaus(solver: Any) -> tuple[dfx.ButcherTableau, ...]:
 def step_with_derivative(
     solver: dfx.AbstractSolver,
     terms: Any,
-    stage_terms: Any,
+    frame: Frame,
     t0: RealScalarLike,
     t1: RealScalarLike,
     y0: Y,
@@ -127,10 +128,14 @@ def step_with_derivative(
 
     It is that of the state before its correction. Where the field is stiff, one evaluated at the
     corrected state would be wrong by the size of the correction times the stiffness. (Diffrax
-    itself evaluates it anew in all lanes of a batch if one of them needs it.)
+    itself evaluates it anew in all lanes of a batch if one of them needs it.) Coordinates that are
+    not states have another one in each step.
     """
-    derivative = refreshed(made_jump, derivative, lambda: solver.func(terms, t0, y0, args))
-    y1, error, dense_info, (_, derivative), result = solver.step(
-        stage_terms, t0, t1, y0, args, (False, derivative), made_jump=False
+    if frame.state is None:
+        derivative = refreshed(made_jump, derivative, lambda: solver.func(terms, t0, y0, args))
+    else:
+        derivative = solver.func(frame.terms, t0, frame.origin, args)
+    w1, error, dense_info, (_, derivative), result = solver.step(
+        frame.terms, t0, t1, frame.origin, args, (False, derivative), made_jump=False
     )
-    return y1, error, dense_info, derivative, result
+    return w1, error, dense_info, derivative, result

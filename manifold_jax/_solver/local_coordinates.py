@@ -8,17 +8,19 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 from diffrax import RESULTS
-from jaxtyping import Array, Float
 
-from .._chart import AbstractChart, push_forward, TangentSpaceChart
+from .._chart import AbstractChart, AbstractCoordinates, TangentSpaceChart
 from .._compat import time_direction
-from .._constraint import AbstractConstraint, check_constraint
+from .._constraint import AbstractConstraint
+from .._constraint_checks import check_constraint
 from .._custom_types import Args, BoolScalar, RealScalarLike, Y
 from .._interpolation import CorrectedInterpolationFactory
 from .._projection import NewtonProjection
 from .._projection_info import ProjectionInfo
-from .advance import advance, conclude, HookState, initial_state
+from .advance import conclude, HookState
 from .base import AbstractManifoldSolver, check_hook_arguments, check_noise
+from .execution import execution_of, Step
+from .frame import Frame
 from .implicit import with_accurate_stages
 from .rewrite import rewrite_terms, RewrittenTerm
 
@@ -53,7 +55,8 @@ class LocalCoordinates(AbstractManifoldSolver):
     constraint: AbstractConstraint
     projection: NewtonProjection
     chart: AbstractChart
-    bend_interpolant: bool
+    bends_interpolant: bool
+    bounds_error: bool
     corrects_output: ClassVar[bool] = True
 
     def __init__(
@@ -71,25 +74,27 @@ class LocalCoordinates(AbstractManifoldSolver):
                 "`chart` must be `mj.TangentSpaceChart()` or `mj.CoordinatePartitionChart()`, got "
                 f"{chart!r}."
             )
-        if constraint.redundant:
-            raise ValueError(
-                "`constraint` is redundant: equations that depend on each other define no local coordinates. "
-                "Remove the dependent ones, or use `mj.Projected(solver, constraint)`."
-            )
+        chart.check(constraint)
         self.inner = with_accurate_stages(solver)
         self.constraint = constraint
         self.projection = NewtonProjection() if projection is None else projection
         self.chart = chart
-        self.bend_interpolant = True
+        self.bends_interpolant = True
+        self.bounds_error = False
 
     @property
     def interpolation_cls(self):  # pyright: ignore
-        return CorrectedInterpolationFactory(self.inner.interpolation_cls, self.bend_interpolant)
+        return CorrectedInterpolationFactory(
+            self.inner.interpolation_cls, self.bends_interpolant, self.chart.state
+        )
 
     def init(self, terms, t0: RealScalarLike, t1: RealScalarLike, y0: Y, args: Args) -> HookState:
         check_noise(self.solver, terms)
         check_constraint(self.constraint, t0, y0, args)
-        return initial_state(self.inner, terms, t0, t1, y0, args)
+        execution = execution_of(self.inner, terms, t0, t1, y0, args)
+        frame = self._coordinates(terms, t0, y0, args).frame(terms, t1, args, self.chart.state)
+        memory = execution.initial_memory(terms, frame, t0, t1, y0, args)
+        return HookState.initial(memory, t0, t1, y0)
 
     def step(
         self,
@@ -101,55 +106,52 @@ class LocalCoordinates(AbstractManifoldSolver):
         solver_state: HookState,
         made_jump: Any,
     ) -> tuple[Y, Y | None, dict[str, Any], HookState, RESULTS]:
-        direction = time_direction(terms)
-        rows = self.chart.directions(self.projection, self.constraint, t0 * direction, y0, args)
-        lift = _Lift(self.constraint, self.projection, direction, rows, y0)
-        stage_terms = rewrite_terms(terms, lambda term: RewrittenTerm(term, lift.field))
-        step = advance(
-            self.inner,
-            terms,
-            stage_terms,
-            t0,
-            t1,
-            y0,
-            args,
-            solver_state.inner,
-            made_jump,
-            lambda y: lift(t1, y, args),
-        )
+        execution = execution_of(self.inner, terms, t0, t1, y0, args)
+        directed = self._coordinates(terms, t0, y0, args)
+        frame = directed.frame(terms, t1, args, self.chart.state)
+        step = execution.step(terms, frame, t0, t1, y0, args, solver_state.memory, made_jump)
         if step.error is not None:
-            pushed = push_forward(self.constraint, t1 * direction, step.y1, args, rows, step.error)
-            step = step._replace(error=pushed)
-        return conclude(step, t0, t1, solver_state, self.projection.rtol is not None)
+            step = step._replace(error=directed.error_of_state(t1, step, args))
+        return conclude(step, t0, t1, solver_state, self.bounds_error)
+
+    def _coordinates(
+        self, terms: Any, t0: RealScalarLike, y0: Y, args: Args
+    ) -> "_DirectedCoordinates":
+        direction = time_direction(terms)
+        of = self.chart.at(self.constraint, self.projection, t0 * direction, y0, args)
+        return _DirectedCoordinates(of, y0, direction)
 
 
-class _Lift(eqx.Module):
-    """From any representative of the coordinates to the point on the manifold."""
+class _DirectedCoordinates(eqx.Module):
+    """Coordinates as functions of Diffrax's time, which is negated backwards."""
 
-    constraint: AbstractConstraint
-    projection: NewtonProjection
-    direction: RealScalarLike
-    rows: Float[Array, "m n"]
+    of: AbstractCoordinates
     centre: Y
+    direction: RealScalarLike
 
-    def __call__(self, t: RealScalarLike, y: Y, args: Args) -> tuple[Y, ProjectionInfo]:
-        return self.projection(
-            self.constraint,
-            t * self.direction,
-            y,
-            args,
-            fallback=self.centre,
-            directions=self.rows,
-        )
+    def frame(self, terms: Any, t1: RealScalarLike, args: Args, state: Any) -> Frame:
+        stage_terms = rewrite_terms(terms, lambda term: RewrittenTerm(term, self.field))
+        correct = lambda w: self.lift(t1, w, args)
+        return Frame(self.of.origin, stage_terms, correct, self.pull_back, state)
 
-    def field(self, term: dfx.AbstractTerm, t: RealScalarLike, y: Y, args: Args) -> Any:
-        """The vector field at the lifted stage, NaN where there is none."""
-        lifted, info = self(t, y, args)
+    def lift(self, t: RealScalarLike, w: Y, args: Args) -> tuple[Y, ProjectionInfo]:
+        return self.of.lift(t * self.direction, w, args)
+
+    def field(self, term: dfx.AbstractTerm, t: RealScalarLike, w: Y, args: Args) -> Any:
+        """The velocity of the coordinates, NaN where there is no lift."""
+        lifted, info = self.lift(t, w, args)
         # Evaluated at a point where it is finite, and then added to: the derivative of a NaN
         # in a step that is rejected would otherwise be NaN, not zero.
         where = lambda a, b: jnp.where(info.success, a, jax.lax.stop_gradient(b))
         lifted = jtu.tree_map(where, lifted, self.centre)
-        return nan_unless(info.success, term.vf(t, lifted, args))
+        velocity = self.pull_back(t, w, lifted, term.vf(t, lifted, args))
+        return nan_unless(info.success, velocity)
+
+    def pull_back(self, t: RealScalarLike, w: Y, y: Y, vector: Y) -> Y:
+        return self.of.pull_back(t * self.direction, w, y, vector)
+
+    def error_of_state(self, t1: RealScalarLike, step: Step, args: Args) -> Y:
+        return self.of.push_forward(t1 * self.direction, step.w1, step.y1, args, step.error)
 
 
 def nan_unless(success: BoolScalar, tree: Any) -> Any:

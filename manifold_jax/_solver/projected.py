@@ -6,13 +6,15 @@ import diffrax as dfx
 from diffrax import RESULTS
 
 from .._compat import time_direction
-from .._constraint import AbstractConstraint, check_constraint
+from .._constraint import AbstractConstraint
+from .._constraint_checks import check_constraint
 from .._custom_types import Args, RealScalarLike, Y
 from .._interpolation import CorrectedInterpolationFactory
 from .._projection import NewtonProjection
-from .._projection_info import ProjectionInfo
-from .advance import advance, conclude, HookState, initial_state
+from .advance import conclude, HookState
 from .base import AbstractManifoldSolver, check_hook_arguments, check_noise
+from .execution import execution_of
+from .frame import Frame
 from .implicit import with_accurate_stages
 
 
@@ -56,9 +58,8 @@ class Projected(AbstractManifoldSolver):
     inner: dfx.AbstractSolver
     constraint: AbstractConstraint
     projection: NewtonProjection
-    # Off where `mj.diffeqsolve` corrects every interpolated value, which makes them continuous
-    # by itself: the same correction of the same point. Bending costs more than interpolating.
-    bend_interpolant: bool
+    bends_interpolant: bool
+    bounds_error: bool
     corrects_output: ClassVar[bool] = True
 
     def __init__(
@@ -72,16 +73,20 @@ class Projected(AbstractManifoldSolver):
         self.inner = with_accurate_stages(solver)
         self.constraint = constraint
         self.projection = NewtonProjection() if projection is None else projection
-        self.bend_interpolant = True
+        self.bends_interpolant = True
+        self.bounds_error = False
 
     @property
     def interpolation_cls(self):  # pyright: ignore
-        return CorrectedInterpolationFactory(self.inner.interpolation_cls, self.bend_interpolant)
+        return CorrectedInterpolationFactory(self.inner.interpolation_cls, self.bends_interpolant)
 
     def init(self, terms, t0: RealScalarLike, t1: RealScalarLike, y0: Y, args: Args) -> HookState:
         check_noise(self.solver, terms)
         check_constraint(self.constraint, t0, y0, args)
-        return initial_state(self.inner, terms, t0, t1, y0, args)
+        execution = execution_of(self.inner, terms, t0, t1, y0, args)
+        frame = self._frame(terms, t1, y0, args)
+        memory = execution.initial_memory(terms, frame, t0, t1, y0, args)
+        return HookState.initial(memory, t0, t1, y0)
 
     def step(
         self,
@@ -93,12 +98,11 @@ class Projected(AbstractManifoldSolver):
         solver_state: HookState,
         made_jump: Any,
     ) -> tuple[Y, Y | None, dict[str, Any], HookState, RESULTS]:
+        execution = execution_of(self.inner, terms, t0, t1, y0, args)
+        frame = self._frame(terms, t1, y0, args)
+        step = execution.step(terms, frame, t0, t1, y0, args, solver_state.memory, made_jump)
+        return conclude(step, t0, t1, solver_state, self.bounds_error)
+
+    def _frame(self, terms: Any, t1: RealScalarLike, y0: Y, args: Args) -> Frame:
         time = t1 * time_direction(terms)
-
-        def correct(y: Y) -> tuple[Y, ProjectionInfo]:
-            return self.projection(self.constraint, time, y, args, fallback=y0)
-
-        step = advance(
-            self.inner, terms, terms, t0, t1, y0, args, solver_state.inner, made_jump, correct
-        )
-        return conclude(step, t0, t1, solver_state, self.projection.rtol is not None)
+        return Frame.of_state(y0, terms, lambda y: self.correct(time, y, args, fallback=y0))

@@ -7,18 +7,18 @@ import jax.numpy as jnp
 from diffrax import RESULTS
 
 from .._compat import is_sde, time_direction, update_result
-from .._constraint import AbstractConstraint, check_constraint
+from .._constraint import AbstractConstraint
+from .._constraint_checks import check_constraint
 from .._custom_types import Args, RealScalarLike, Y
 from .._interpolation import CorrectedInterpolationFactory
 from .._projection import NewtonProjection
 from .._projection_info import ProjectionInfo
-from .._stabilization import (
-    AbstractStabilization,
-    ExactStabilization,
-    is_stable,
-)
-from .advance import advance, conclude, HookState, initial_state, result_of_state
+from .._stability import is_stable
+from .._stabilization import AbstractStabilization
+from .advance import conclude, HookState, result_of_state
 from .base import AbstractManifoldSolver, check_hook_arguments
+from .execution import execution_of
+from .frame import Frame
 from .implicit import with_accurate_stages
 from .rewrite import has_several, rewrite_terms, RewrittenTerm
 
@@ -53,7 +53,8 @@ class Stabilized(AbstractManifoldSolver):
     constraint: AbstractConstraint
     projection: NewtonProjection
     stabilization: AbstractStabilization
-    bend_interpolant: bool
+    bends_interpolant: bool
+    bounds_error: bool
 
     def __init__(
         self,
@@ -73,17 +74,17 @@ class Stabilized(AbstractManifoldSolver):
         self.constraint = constraint
         self.projection = NewtonProjection() if projection is None else projection
         self.stabilization = stabilization
-        self.bend_interpolant = True
+        self.bends_interpolant = True
+        self.bounds_error = False
 
     @property
     def corrects_output(self) -> bool:
-        exact = isinstance(self.stabilization, ExactStabilization)
-        return exact and self.stabilization.ends_on_manifold
+        return self.stabilization.ends_on_manifold
 
     @property
     def interpolation_cls(self):  # pyright: ignore
         return CorrectedInterpolationFactory(
-            self.inner.interpolation_cls, self.bend_interpolant and self.corrects_output
+            self.inner.interpolation_cls, self.bends_interpolant and self.corrects_output
         )
 
     def func(self, terms, t0: RealScalarLike, y0: Y, args: Args) -> Any:
@@ -101,7 +102,11 @@ class Stabilized(AbstractManifoldSolver):
                 "them up in one `diffrax.ODETerm`, or use `mj.Projected(solver, constraint)`."
             )
         check_constraint(self.constraint, t0, y0, args)
-        return initial_state(self.inner, self._stabilized(terms), t0, t1, y0, args)
+        terms = self._stabilized(terms)
+        execution = execution_of(self.inner, terms, t0, t1, y0, args)
+        frame = self._frame(terms, t0, t1, y0, args)
+        memory = execution.initial_memory(terms, frame, t0, t1, y0, args)
+        return HookState.initial(memory, t0, t1, y0)
 
     def step(
         self,
@@ -113,22 +118,26 @@ class Stabilized(AbstractManifoldSolver):
         solver_state: HookState,
         made_jump: Any,
     ) -> tuple[Y, Y | None, dict[str, Any], HookState, RESULTS]:
+        terms = self._stabilized(terms)
+        execution = execution_of(self.inner, terms, t0, t1, y0, args)
+        frame = self._frame(terms, t0, t1, y0, args)
+        step = execution.step(terms, frame, t0, t1, y0, args, solver_state.memory, made_jump)
+        if not self.corrects_output:  # nothing has looked at the state
+            step = step._replace(result=update_result(step.result, result_of_state(step.y1)))
+        return conclude(step, t0, t1, solver_state, self.bounds_error)
+
+    def _frame(
+        self, terms: Any, t0: RealScalarLike, t1: RealScalarLike, y0: Y, args: Args
+    ) -> Frame:
         time = t1 * time_direction(terms)
-        stable = is_stable(self.stabilization.gain, jnp.asarray(t1) - t0, self.solver)
+        stable = is_stable(self.stabilization.rate, jnp.asarray(t1) - t0, self.solver)
 
         def correct(y: Y) -> tuple[Y, ProjectionInfo]:
             if not self.corrects_output:
                 return y, ProjectionInfo.of_nothing(y, stable)
-            return self.projection(self.constraint, time, y, args, fallback=y0)
+            return self.correct(time, y, args, fallback=y0)
 
-        terms = self._stabilized(terms)
-        step = advance(
-            self.inner, terms, terms, t0, t1, y0, args, solver_state.inner, made_jump, correct
-        )
-        if not self.corrects_output:  # nothing has looked at the state
-            step = step._replace(result=update_result(step.result, result_of_state(step.y1)))
-        raise_error = self.corrects_output and self.projection.rtol is not None
-        return conclude(step, t0, t1, solver_state, raise_error)
+        return Frame.of_state(y0, terms, correct)
 
     def _stabilized(self, terms: Any) -> Any:
         direction = time_direction(terms)

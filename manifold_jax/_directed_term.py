@@ -7,7 +7,7 @@ import diffrax as dfx
 import jax.numpy as jnp
 import jax.tree_util as jtu
 
-from .._custom_types import Args, RealScalarLike, Y
+from ._custom_types import Args, RealScalarLike, Y
 
 
 class DirectedTerm(dfx.AbstractTerm):

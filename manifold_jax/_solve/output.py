@@ -10,9 +10,9 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array
 
-from ._compat import save_y
-from ._custom_types import Args, BoolScalar, Y
-from ._solver.base import AbstractManifoldSolver
+from .._compat import save_y
+from .._custom_types import Args, BoolScalar, Y
+from .._solver.base import AbstractManifoldSolver
 
 
 def _is_sub(x: Any) -> bool:
@@ -39,7 +39,7 @@ def on_manifold_saving(
             return sub
 
         def fn(t, y, args):
-            corrected, info = solver.projection(solver.constraint, t, y, args)
+            corrected, info = solver.correct(t, y, args)
             return sub.fn(t, _nan_unless(info.success, corrected), args), info.success
 
         return eqx.tree_at(lambda s: s.fn, sub, fn)
@@ -120,9 +120,7 @@ def _corrected(
     """
     used = jnp.isfinite(t)
     y = jtu.tree_map(lambda a, b: jnp.where(used, a, b), y, y0)
-    corrected, info = solver.projection(
-        solver.constraint, jnp.where(used, t, jnp.zeros_like(t)), y, args
-    )
+    corrected, info = solver.correct(jnp.where(used, t, jnp.zeros_like(t)), y, args)
     missing = jnp.where(used, jnp.nan, jnp.inf)
     valid = used & info.success
     out = jtu.tree_map(lambda a: jnp.where(valid, a, missing.astype(a.dtype)), corrected)

@@ -7,13 +7,12 @@ import equinox as eqx
 import jax.numpy as jnp
 import jax.tree_util as jtu
 
-from ._compat import save_y
-from ._custom_types import RealScalarLike, Y
-from ._mechanics import MechanicalSystem
-from ._mechanics.term import DirectedTerm
-from ._solver import Stabilized
-from ._stabilization import is_stable, stability_interval
-from ._user_function import check_function
+from .._compat import save_y
+from .._custom_types import RealScalarLike, Y
+from .._directed_term import DirectedTerm
+from .._solver import Stabilized
+from .._stability import is_stable, stability_interval
+from .._user_function import check_function
 
 
 # What Diffrax passes to an event function by name.
@@ -29,6 +28,7 @@ def check_arguments(
     stepsize_controller: Any,
     adjoint: Any,
     event: Any,
+    consistent: str,
 ) -> None:
     if isinstance(terms, dfx.AbstractSolver):
         raise TypeError(
@@ -58,12 +58,31 @@ def check_arguments(
             f"`dt0` must be the length of the first step, with the sign of t1 - t0, got {dt0}. With an adaptive "
             "`stepsize_controller` it may be None."
         )
+    _check_choices(adjoint, consistent)
+
+
+def _check_choices(adjoint: Any, consistent: str) -> None:
+    if isinstance(adjoint, dfx.ImplicitAdjoint):
+        raise ValueError(
+            "`adjoint=ImplicitAdjoint()` inverts df/dy, which is singular on a manifold: it says nothing of the "
+            "directions across. Leave `adjoint` out (`mj.StepReplayAdjoint()`), or for the minimum of a function "
+            "`mj.gradient_flow`."
+        )
+    if isinstance(adjoint, dfx.BacksolveAdjoint):
+        raise ValueError(
+            "`adjoint=BacksolveAdjoint()` loses the gradient through the corrections (it would be silently wrong). "
+            "Leave `adjoint` out (`mj.StepReplayAdjoint()`), or use `diffrax.ForwardMode()`."
+        )
+    if consistent not in ("project", "check", "assume"):
+        raise ValueError(
+            f"`consistent` must be 'project', 'check' or 'assume', got {consistent!r}."
+        )
 
 
 def _check_terms(terms: Any) -> None:
-    if isinstance(terms, MechanicalSystem):
+    if isinstance(getattr(terms, "terms", None), dfx.AbstractTerm):
         raise TypeError(
-            "`terms` is an `mj.MechanicalSystem`: pass its vector field, `system.terms`."
+            f"`terms` is an `mj.{type(terms).__name__}`: pass its vector field, `system.terms`."
         )
     is_term = lambda x: isinstance(x, dfx.AbstractTerm)
     leaves = jtu.tree_leaves(terms, is_leaf=is_term)
@@ -90,7 +109,7 @@ def raise_if_unstable(y0: Y, terms: Any, solver: dfx.AbstractSolver, dt0: RealSc
     stabilized = isinstance(solver, Stabilized)
     if not stabilized and not isinstance(terms, DirectedTerm):
         return y0
-    gain = solver.stabilization.gain if stabilized else terms.rate
+    gain = solver.stabilization.rate if stabilized else terms.rate
     inner = solver.solver if isinstance(solver, dfx.AbstractWrappedSolver) else solver
     interval = stability_interval(inner)
     y0 = jtu.tree_map(jnp.asarray, y0)

@@ -1,0 +1,227 @@
+"""Correction of one point onto the manifold of any residual (the paper's perturbation approach).
+
+The corrected point is `p = x + V z` with directions `V` (shape `(n, m)`, held as the rows of `V^T`)
+that are fixed at the point `x` that is corrected, and `z` the root of `g(t, x + V z, args) = 0`.
+"""
+
+import dataclasses
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.flatten_util as jfu
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ._custom_types import Args, BoolScalar, FloatScalar, IntScalar, RealScalarLike, Y
+from ._linear import combine, Factorization, factorize, gram, pseudo_invert, PseudoInverse
+from ._newton import AbstractEquations, chord, damped_newton, implicit_tangent
+from ._projection import NewtonProjection
+from ._residual import as_time, jacobian, residual_vector, row_scale
+
+
+class Normals(NamedTuple):
+    """What leads across the manifold at a point: the Jacobian `G`, and the directions, the rows of
+    `V^T`, along which points nearby are corrected, by default `V = W^-1 G^T`. Both `(m, k)` for
+    `k` components that are moved together, by default the `n` of the state."""
+
+    jacobian: Float[Array, "m k"]
+    directions: Float[Array, "m k"]
+
+
+class Crossing(NamedTuple):
+    """The normals at a point with `G V` factored: the linearization of a correction."""
+
+    normals: Normals
+    factorization: Factorization | PseudoInverse
+
+    @staticmethod
+    def of(normals: Normals, redundant: bool, dependent: FloatScalar | float = 1e-4) -> "Crossing":
+        """`dependent` as in `pseudo_invert`, for `redundant` equations."""
+        A = gram(*normals)
+        if not redundant:
+            return Crossing(normals, factorize(A))
+        return Crossing(normals, pseudo_invert(A, equilibrated=True, dependent=dependent))
+
+    def solve(self, b: Float[Array, " m"]) -> Float[Array, " m"]:
+        return self.factorization.solve(b)
+
+
+def _dependent(ratio: FloatScalar) -> FloatScalar:
+    return jax.lax.stop_gradient(jnp.clip(ratio, 1e4 * jnp.finfo(ratio.dtype).eps, 1e-4))
+
+
+class CorrectionEquations(AbstractEquations):
+    """`g(t, x + V z, args) = 0` in the multipliers `z`; `V = W^-1 G(x)^T` unless given."""
+
+    function: Any  # (t, x, args)
+    t: Array
+    x: Float[Array, " n"]
+    args: Args
+    inverse_metric: Float[Array, " n"] | None = None
+    directions: Float[Array, "m n"] | None = None
+    redundant: bool = eqx.field(static=True, default=False)
+
+    def residual(self, x: Float[Array, " n"]) -> Float[Array, " m"]:
+        return self.function(self.t, x, self.args)
+
+    def point(self, z: Float[Array, " m"]) -> Float[Array, " n"]:
+        """`x + V z` without forming `V`, so that its derivative does not either."""
+        if self.directions is not None:
+            return self.x + combine(z, self.directions)
+        _, pullback = jax.vjp(self.residual, self.x)
+        (d,) = pullback(z)
+        return self.x + (d if self.inverse_metric is None else self.inverse_metric * d)
+
+    def linearize(self, x: Float[Array, " n"]) -> Crossing:
+        G = jacobian(self.residual, x)[1]
+        if self.directions is not None:
+            return Crossing.of(Normals(G, self.directions), self.redundant)
+        (_, directions), level = self._normals()
+        # `G V` of two points, whose dependence differs by the distance between them.
+        dependent = _dependent(1e3 * level) if self.redundant else 0.0
+        return Crossing.of(Normals(G, directions), self.redundant, dependent)
+
+    def crossing(self) -> Crossing:
+        """At the point that is corrected."""
+        normals, level = self._normals()
+        # Equations that depend on each other on the manifold do so beside it up to the distance.
+        dependent = _dependent(1e6 * level**2) if self.redundant else 0.0
+        return Crossing.of(normals, self.redundant, dependent)
+
+    def normals(self) -> Normals:
+        return self._normals()[0]
+
+    def _normals(self) -> tuple[Normals, FloatScalar]:
+        """And how far from the manifold the point is."""
+        r, G = jacobian(self.residual, self.x)
+        level = jnp.max(jnp.abs(r) / row_scale(G, self.x))
+        if self.directions is not None:
+            return Normals(G, self.directions), level
+        directions = G if self.inverse_metric is None else G * self.inverse_metric[None, :]
+        return Normals(G, directions), level
+
+    def starting_at(self, x: Float[Array, " n"]) -> "CorrectionEquations":
+        return dataclasses.replace(self, x=x)
+
+    def along(self, directions: Float[Array, "m n"]) -> "CorrectionEquations":
+        return dataclasses.replace(self, directions=directions)
+
+
+class CorrectionRoot(NamedTuple):
+    """The corrected point, its multipliers, and how it went."""
+
+    p: Float[Array, " n"]
+    z: Float[Array, " m"]
+    iterations: IntScalar
+    residual: FloatScalar
+    full_rank: BoolScalar
+    success: BoolScalar
+
+
+def solve_correction(
+    equations: CorrectionEquations,
+    safe: Float[Array, " n"],
+    projection: NewtonProjection,
+    far: bool,
+    crossing: Crossing | None = None,
+) -> CorrectionRoot:
+    """The root that the settings in `projection` lead to.
+
+    The derivative of a failed correction is taken at `safe`. Corrections that share a
+    Jacobian and its factorization pass them on as `crossing`.
+    """
+    if projection.max_steps == 1 and not far:
+        return _correct_once(equations, safe, crossing)
+    tolerance = projection.tolerance_for(equations.x.dtype)
+    return _solve(equations, safe, projection.max_steps, tolerance, far, crossing)
+
+
+def _correct_once(
+    equations: CorrectionEquations, safe: Float[Array, " n"], crossing: Crossing | None
+) -> CorrectionRoot:
+    """One Newton step, `x - V (G V)^-1 g(x)`, successful if it lowers the residual.
+
+    Differentiated as it stands: it is a map of its own, not an approximation of the root.
+    """
+    finite = jnp.all(jnp.isfinite(equations.x))
+    equations = equations.starting_at(jnp.where(finite, equations.x, safe))
+    if crossing is None:
+        crossing = equations.crossing()
+    (G, directions), factorization = crossing
+    scale = row_scale(G, equations.x)
+    r = equations.residual(equations.x)
+    z = -factorization.solve(r)
+    p = equations.x + combine(z, directions)
+    before, after = (jnp.max(jnp.abs(x) / scale) for x in (r, equations.residual(p)))
+    rounding = 50 * jnp.finfo(r.dtype).eps
+    success = finite & factorization.full_rank & (after <= jnp.maximum(before, rounding))
+    p = jnp.where(success, p, equations.x)
+    residual = jnp.where(finite, after, jnp.nan)
+    one = jnp.ones((), jnp.int32)
+    return CorrectionRoot(p, z, one, residual, factorization.full_rank, success)
+
+
+@eqx.filter_custom_jvp
+def _solve(
+    equations: CorrectionEquations,
+    safe: Float[Array, " n"],
+    max_steps: int,
+    tolerance: Any,
+    far: bool,
+    crossing: Crossing | None,
+) -> CorrectionRoot:
+    del safe
+    if crossing is None:
+        crossing = equations.crossing()
+    (G, directions), factorization = crossing
+    r = equations.residual(equations.x)
+    fixed, scale, z = equations.along(directions), row_scale(G, equations.x), jnp.zeros_like(r)
+    if far:
+        root = damped_newton(fixed, z, r, scale, max_steps, tolerance)
+    else:
+        root = chord(fixed, crossing, z, r, scale, max_steps)
+    full_rank = factorization.full_rank
+    success = (root.level <= tolerance) & full_rank
+    p = jnp.where(success, fixed.point(root.z), equations.x)
+    return CorrectionRoot(p, root.z, root.iterations, root.level, full_rank, success)
+
+
+@_solve.def_jvp
+def _solve_jvp(primals, tangents):
+    equations, safe, *_ = primals
+    root = _solve(*primals)
+    # A failed projection may have met NaN. Move to a point where g is finite *before*
+    # differentiating: selecting afterwards would leave 0 * NaN in reverse mode.
+    equations = equations.starting_at(jnp.where(root.success, equations.x, safe))
+    z = jnp.where(root.success, root.z, 0)
+    dz, moved, crossing = implicit_tangent(equations, tangents[0], z)
+    p_dot = moved + combine(dz, crossing.normals.directions)
+    return root, CorrectionRoot(p_dot, dz, None, jnp.zeros_like(root.residual), None, None)
+
+
+def equations_of(
+    function: Any,
+    t: RealScalarLike,
+    y: Y,
+    args: Args,
+    projection: NewtonProjection,
+    redundant: bool,
+    directions: Float[Array, "m n"] | None = None,
+) -> CorrectionEquations:
+    """Those of the residual `function(t, y, args)` of a whole state."""
+    x, unravel = jfu.ravel_pytree(y)
+    t = as_time(t, x.dtype)
+    # Parameters that the residual closes over become inputs, so that they are differentiated.
+    residual = eqx.filter_closure_convert(
+        lambda t, x, args: residual_vector(function, t, unravel(x), args), t, x, args
+    )
+    metric = projection.inverse_metric(y)
+    return CorrectionEquations(residual, t, x, args, metric, directions, redundant)
+
+
+def without_normal_part(
+    normals: Normals, e: Float[Array, " k"], rate: Float[Array, " m"], redundant: bool = False
+) -> Float[Array, " k"]:
+    """`e - V (G V)^-1 rate`, tangent if `rate = G e`."""
+    return e - combine(Crossing.of(normals, redundant).solve(rate), normals.directions)

@@ -1,0 +1,139 @@
+"""The correction of mechanical states: first the positions, then the velocities.
+
+    phi(t, q_hat + V_q z) = 0,        C (v_hat + V zeta) = b,        V = M^-1 C^T at (q_hat, v_hat)
+
+with `C` the Jacobian of all constraints with respect to the velocities, whose first rows are
+`J = dphi/dq`, and one factorization of `C V` for both. The velocities are corrected at the
+corrected positions. Neither needs the derivative of `J v`, half of the full Jacobian.
+
+Source: Eich, SIAM J. Numer. Anal. 30 (1993) 1467-1482; Lubich, Nowak, Poehle & Engstler,
+MEXX (1992).
+"""
+
+import dataclasses
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from .._correction import CorrectionEquations, CorrectionRoot, Crossing, Normals, solve_correction
+from .._custom_types import Args, BoolScalar, Y
+from .._projection import NewtonProjection
+from .kinematics import Kinematics
+
+
+class InverseMetrics(NamedTuple):
+    """Diagonals of `W^-1` for positions and velocities, if it is not the inverse mass matrix."""
+
+    positions: Float[Array, " k"]
+    velocities: Float[Array, " k"]
+
+    @staticmethod
+    def of(projection: NewtonProjection, y: Y) -> "InverseMetrics | None":
+        diagonal = projection.inverse_metric(y)
+        if diagonal is None and projection.metric != "identity":
+            return None
+        k = sum(leaf.size for leaf in jax.tree_util.tree_leaves(y[0]))
+        if diagonal is None:
+            diagonal = jnp.ones(2 * k, jnp.result_type(*jax.tree_util.tree_leaves(y)))
+        return InverseMetrics(diagonal[:k], diagonal[k:])
+
+
+class TwoStages(NamedTuple):
+    """How states near one are corrected; `directions` are `V^T` if they are not those of the
+    state itself."""
+
+    equations: Kinematics
+    t: Array
+    args: Args
+    projection: NewtonProjection
+    metrics: InverseMetrics | None
+    directions: Float[Array, "m k"] | None
+    redundant: bool
+
+    def correct(
+        self, y: Y, fallback: Y, far: bool
+    ) -> tuple[Y, tuple[CorrectionRoot, CorrectionRoot]]:
+        """The corrected state, and the roots for the positions and the velocities."""
+        equations = self.equations
+        x, w = equations.flat(y)
+        safe_x, safe_w = jax.lax.stop_gradient(equations.flat(fallback))
+        # Replaced before anything is evaluated there: the derivative of a NaN is never zero.
+        finite = jnp.all(jnp.isfinite(x)) & jnp.all(jnp.isfinite(w))
+        x, w = jnp.where(finite, x, safe_x), jnp.where(finite, w, safe_w)
+
+        crossing, p = self._crossing(x, w)
+        positions = self._positions(x, safe_x, crossing, p, far)
+        if far:  # the matrix at the corrected positions: the nearest velocities
+            crossing, _ = self._crossing(positions.p, w)
+        velocities = self._velocities(positions.p, w, safe_w, crossing, far)
+        corrected = tuple(
+            equations.unravel(jnp.where(finite, root.p, jnp.nan))
+            for root in (positions, velocities)
+        )
+        return corrected, (_failed_unless(finite, positions), _failed_unless(finite, velocities))
+
+    def normals(self, x: Float[Array, " k"], w: Float[Array, " k"]) -> "MechanicalNormals":
+        C, p = self.equations.rows(self.t, x, w, self.args)
+        directions, valid = self.directions, jnp.asarray(True)
+        if directions is None and self.metrics is not None:
+            directions = C * self.metrics.velocities[None, :]
+        elif directions is None:
+            mass = self.equations.mass(self.t, x, w, self.args, C)
+            directions, valid = mass.solve(C), mass.valid
+        return MechanicalNormals(Normals(C, directions), p, valid)
+
+    def _crossing(self, x: Float[Array, " k"], w: Float[Array, " k"]) -> tuple[Crossing, int]:
+        normals, p, valid = self.normals(x, w)
+        crossing = Crossing.of(normals, self.redundant)
+        full_rank = crossing.factorization.full_rank & valid
+        factorization = dataclasses.replace(crossing.factorization, full_rank=full_rank)
+        return Crossing(normals, factorization), p
+
+    def _positions(self, x, safe, crossing: Crossing, p: int, far: bool) -> CorrectionRoot:
+        if p == 0:
+            return _nothing_to_do(x)
+        (C, directions), _ = crossing
+        if self.metrics is not None:  # one for positions of its own
+            directions = directions * (self.metrics.positions / self.metrics.velocities)[None, :]
+        if p < C.shape[0] or self.metrics is not None:
+            crossing = Crossing.of(Normals(C[:p], directions[:p]), self.redundant)
+        residual = eqx.filter_closure_convert(self.equations.position, self.t, x, self.args)
+        return self._solve(residual, x, self.args, safe, crossing, far)
+
+    def _velocities(self, x, w, safe, crossing: Crossing, far: bool) -> CorrectionRoot:
+        context = (x, self.args)
+        residual = eqx.filter_closure_convert(self.equations.velocity, self.t, w, context)
+        return self._solve(residual, w, context, safe, crossing, far)
+
+    def _solve(self, residual, x, args, safe, crossing: Crossing, far: bool) -> CorrectionRoot:
+        equations = CorrectionEquations(
+            residual,
+            self.t,
+            x,
+            args,
+            directions=crossing.normals.directions,
+            redundant=self.redundant,
+        )
+        return solve_correction(equations, safe, self.projection, far, crossing)
+
+
+class MechanicalNormals(NamedTuple):
+    """With respect to the velocities; how many of the rows belong to positions, and whether the
+    mass matrix can be used."""
+
+    normals: Normals
+    num_positions: int
+    valid: BoolScalar
+
+
+def _nothing_to_do(x: Float[Array, " k"]) -> CorrectionRoot:
+    yes, zero = jnp.asarray(True), jnp.zeros((), x.dtype)
+    return CorrectionRoot(x, jnp.zeros((0,), x.dtype), jnp.zeros((), jnp.int32), zero, yes, yes)
+
+
+def _failed_unless(finite: BoolScalar, root: CorrectionRoot) -> CorrectionRoot:
+    residual = jnp.where(finite, root.residual, jnp.nan)
+    return root._replace(residual=residual, success=root.success & finite)

@@ -1,0 +1,98 @@
+"""Constraints on positions and on velocities, and the mass matrix, as functions of vectors."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.flatten_util as jfu
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jaxtyping import Array, Float
+
+from .._custom_types import Args, Y
+from .._residual import jacobian
+from .mass import factorize_mass, Mass, mass_values
+
+
+class Kinematics(NamedTuple):
+    """The constraints as functions of vectors, `x` for positions and `w` for velocities, each of
+    `k` numbers."""
+
+    holonomic: Callable | None
+    nonholonomic: Callable | None
+    mass_matrix: Callable
+    unravel: Callable
+
+    @staticmethod
+    def of(system: Any, y: Y) -> "Kinematics":
+        """Of a mechanical system, or of its constraint, for states like `y`."""
+        q, _ = check_mechanical_state(y)
+        unravel = jfu.ravel_pytree(q)[1]
+        return Kinematics(system.holonomic, system.nonholonomic, system.mass_matrix, unravel)
+
+    def flat(self, y: Y) -> tuple[Float[Array, " k"], Float[Array, " k"]]:
+        q, v = y
+        return jfu.ravel_pytree(q)[0], jfu.ravel_pytree(v)[0]
+
+    def position(self, t: Array, x: Float[Array, " k"], args: Args) -> Float[Array, " p"]:
+        if self.holonomic is None:
+            return jnp.zeros((0,), x.dtype)
+        return jfu.ravel_pytree(self.holonomic(t, self.unravel(x), args))[0]
+
+    def velocity(
+        self, t: Array, w: Float[Array, " k"], context: tuple[Float[Array, " k"], Args]
+    ) -> Float[Array, " m"]:
+        """Residual of the velocities at the positions in `context`."""
+        x, args = context
+        position = lambda t, x: self.position(t, x, args)
+        _, rate = jax.jvp(position, (t, x), (jnp.ones_like(t), w))
+        if self.nonholonomic is None:
+            return rate
+        extra = self.nonholonomic(t, self.unravel(x), self.unravel(w), args)
+        return jnp.concatenate([rate, jfu.ravel_pytree(extra)[0]])
+
+    def rows(
+        self, t: Array, x: Float[Array, " k"], w: Float[Array, " k"], args: Args
+    ) -> tuple[Float[Array, "m k"], int]:
+        """`C = [J; da/dv]`, and how many of the rows belong to positions."""
+        _, J = jacobian(lambda x: self.position(t, x, args), x)
+        if self.nonholonomic is None:
+            return J, J.shape[0]
+        nonholonomic = lambda w: self.velocity(t, w, (x, args))[J.shape[0] :]
+        return jnp.concatenate([J, jacobian(nonholonomic, w)[1]]), J.shape[0]
+
+    def acceleration_bias(
+        self, t: Array, x: Float[Array, " k"], w: Float[Array, " k"], args: Args
+    ) -> Float[Array, " m"]:
+        """What the second derivative of the constraints is at zero acceleration."""
+        velocity = lambda t, x: self.velocity(t, w, (x, args))
+        return jax.jvp(velocity, (t, x), (jnp.ones_like(t), w))[1]
+
+    def mass(
+        self,
+        t: Array,
+        x: Float[Array, " k"],
+        w: Float[Array, " k"],
+        args: Args,
+        C: Float[Array, "m k"],
+    ) -> Mass:
+        q, v = self.unravel(x), self.unravel(w)
+        values = mass_values(self.mass_matrix(t, q, v, args), q)
+        return factorize_mass(values, C)
+
+
+def check_mechanical_state(y: Y) -> tuple[Any, Any]:
+    """Refuse, while tracing, states that are not `(q, v)`."""
+    if not (isinstance(y, tuple) and len(y) == 2):
+        raise ValueError(
+            "`y` must be the tuple `(q, v)` of positions and velocities of a mechanical system, got "
+            f"{type(y).__name__}. Write e.g. `y0 = (q0, jnp.zeros_like(q0))`."
+        )
+    q, v = y
+    shapes = lambda tree: jtu.tree_map(jnp.shape, tree)
+    if jtu.tree_structure(q) != jtu.tree_structure(v) or shapes(q) != shapes(v):
+        raise ValueError(
+            f"`y` = (q, v) must have velocities of the same structure and shapes as the positions, v = dq/dt, got "
+            f"{shapes(q)} and {shapes(v)}."
+        )
+    return q, v

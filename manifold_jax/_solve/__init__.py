@@ -1,0 +1,1 @@
+from .diffeqsolve import diffeqsolve as diffeqsolve

@@ -1,0 +1,125 @@
+"""The front end: `diffrax.diffeqsolve` plus what a solver cannot do by itself."""
+
+from typing import Any
+
+import diffrax as dfx
+import equinox as eqx
+
+from .._adjoint import LocatingAdjoint, StepReplayAdjoint
+from .._custom_types import Args, RealScalarLike, Y
+from .._errors import clear_errors
+from .._solver.base import AbstractManifoldSolver
+from .arguments import check_arguments, raise_if_unstable
+from .finish import finish
+from .output import events_in_true_time, on_manifold_saving
+from .prepare import prepare
+from .start import Consistent
+from .without_hook import solve_without_hook
+
+
+@clear_errors
+@eqx.filter_jit
+def diffeqsolve(
+    terms: Any,
+    solver: dfx.AbstractSolver,
+    t0: RealScalarLike,
+    t1: RealScalarLike,
+    dt0: RealScalarLike | None,
+    y0: Y,
+    args: Args = None,
+    *,
+    saveat: dfx.SaveAt = dfx.SaveAt(t1=True),
+    stepsize_controller: dfx.AbstractStepSizeController = dfx.ConstantStepSize(),
+    adjoint: dfx.AbstractAdjoint = StepReplayAdjoint(),
+    event: dfx.Event | None = None,
+    max_steps: int | None = 4096,
+    throw: bool = True,
+    progress_meter: dfx.AbstractProgressMeter = dfx.NoProgressMeter(),
+    solver_state: Any = None,
+    controller_state: Any = None,
+    made_jump: Any = None,
+    consistent: Consistent = "project",
+) -> dfx.Solution:
+    """Solve a differential equation on a manifold.
+
+    Takes the arguments of `diffrax.diffeqsolve` and returns its `Solution`. In addition the
+    initial value is made consistent, and every value handed out is on the manifold: saved
+    values, the dense solution `sol.evaluate`, what `SaveAt(fn=...)` and event functions see,
+    and the state at an event.
+
+    **Arguments:** as `diffrax.diffeqsolve`, and
+
+    - `solver`: [`Projected`][] or another solver of this library. (Any other Diffrax solver
+        is passed on, for comparisons; implicit stages are solved to round-off there, too.)
+    - `dt0`: `None` with an adaptive controller chooses the first step from the vector field
+        (Hairer, Norsett & Wanner, Solving ODEs I, II.4).
+    - `consistent`: what to do with `y0`. `"project"` moves it onto the manifold, `"check"`
+        refuses it if it is not there (to `tolerance`), `"assume"` trusts it.
+    - `event`: event functions get the true time, also when integrating backwards. With a root
+        finder the earliest event ends the solve, whatever the order of `cond_fn`.
+    - `adjoint`: how derivatives are computed, by default in reverse mode by
+        [`StepReplayAdjoint`][], from the very steps that were made. For forward mode pass
+        `diffrax.ForwardMode()`. Diffrax's other adjoints compute steps again, which round
+        differently and get other sizes: where tolerances are tight their gradients are less
+        accurate than the solution.
+
+    Python numbers among the arguments (`t1`, tolerances) are part of the compiled program; pass
+    `jnp.asarray(...)` to solve with other values without compiling again.
+
+    **Returns:**
+
+    A `diffrax.Solution`; `sol.stats` has in addition
+
+    - `initial_correction`: how far `y0` was moved, the largest `|change| / (|y0| + 1)`;
+    - `num_projection_iterations`: Newton iterations over all accepted steps;
+    - `largest_correction`: the largest such correction of an accepted step;
+    - `correction_share`: with [`Projected`][] the part of the steps that the corrections undid,
+        their sum over that of the displacements. Where the field is tangent it is as small as the
+        tolerance; if it is not, see [`tangent_field`][].
+
+    **Raises:**
+
+    `TypeError` or `ValueError` for arguments that cannot work. With `throw=True` a
+    `RuntimeError` where the solve fails; with `throw=False` look at `sol.result`:
+    `RESULTS.nonlinear_divergence` is a constraint that could not be satisfied, and
+    `RESULTS.nonfinite` a state that is NaN or infinite, also with a solver of Diffrax alone.
+
+    Source: Sudarsan & Keerthi, Appl. Math. Comput. 92 (1998) 153-193.
+    """
+    check_arguments(terms, solver, dt0, saveat, stepsize_controller, adjoint, event, consistent)
+    if event is not None and event.root_finder is not None:
+        adjoint = LocatingAdjoint(adjoint)
+    options = dict(
+        stepsize_controller=stepsize_controller,
+        adjoint=adjoint,
+        max_steps=max_steps,
+        progress_meter=progress_meter,
+        solver_state=solver_state,
+        controller_state=controller_state,
+        made_jump=made_jump,
+    )
+    if throw and isinstance(stepsize_controller, dfx.ConstantStepSize) and dt0 is not None:
+        y0 = raise_if_unstable(y0, terms, solver, dt0)
+    if not isinstance(solver, AbstractManifoldSolver):
+        return solve_without_hook(
+            terms, solver, t0, t1, dt0, y0, args, saveat, throw, event=event, **options
+        )
+    bends_interpolant = event is not None  # every interpolated value is corrected otherwise
+    solver = solver.within(stepsize_controller, bends_interpolant)
+    ready = prepare(
+        terms, solver, t0, t1, dt0, y0, args, saveat, stepsize_controller, consistent, throw
+    )
+    sol = dfx.diffeqsolve(
+        terms,
+        solver,
+        ready.t0,
+        ready.t1,
+        ready.dt0,
+        ready.y0,
+        args,
+        saveat=on_manifold_saving(saveat, solver, event),
+        event=events_in_true_time(event, terms, ready.t0, ready.t1, ready.dt0),
+        throw=False,
+        **options,
+    )
+    return finish(sol, solver, saveat, event, ready.y0, args, ready.start, throw)

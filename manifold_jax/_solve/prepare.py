@@ -1,0 +1,72 @@
+"""What is done before the loop: types, the initial value, and the first step."""
+
+from typing import Any, NamedTuple
+
+import diffrax as dfx
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jaxtyping import Array
+
+from .._constraint_checks import check_constraint, check_state
+from .._custom_types import Args, RealScalarLike, Y
+from .._directed_term import DirectedTerm
+from .._solver.base import AbstractManifoldSolver, controller_tolerances
+from .first_step import initial_step
+from .start import Consistent, start_state, StartInfo
+
+
+class Ready(NamedTuple):
+    """What a loop starts from; all times in one type of number."""
+
+    t0: Array
+    t1: Array
+    dt0: RealScalarLike | None
+    y0: Y
+    start: StartInfo
+
+
+def prepare(
+    terms: Any,
+    solver: AbstractManifoldSolver,
+    t0: RealScalarLike,
+    t1: RealScalarLike,
+    dt0: RealScalarLike | None,
+    y0: Y,
+    args: Args,
+    saveat: dfx.SaveAt,
+    controller: dfx.AbstractStepSizeController,
+    consistent: Consistent,
+    throw: bool,
+) -> Ready:
+    """`controller` chooses the first step if `dt0` is None."""
+    time_dtype = _time_dtype(t0, t1, dt0, saveat)
+    y0 = _as_state(y0, time_dtype)
+    t0, t1 = jnp.asarray(t0, time_dtype), jnp.asarray(t1, time_dtype)
+    check_constraint(solver.constraint, t0, y0, args)
+    y0, start = start_state(solver.constraint, t0, y0, args, solver.projection, consistent, throw)
+    if dt0 is None:
+        dt0 = _first_step(terms, solver, t0, t1, y0, args, controller)
+    return Ready(t0, t1, dt0, y0, start)
+
+
+def _time_dtype(t0: Any, t1: Any, dt0: Any, saveat: dfx.SaveAt) -> Any:
+    """The type in which Diffrax will hold times, and the least precision of the state."""
+    subs = jtu.tree_leaves(saveat.subs, is_leaf=lambda x: isinstance(x, dfx.SubSaveAt))
+    times = [t for t in (t0, t1, dt0, *(s.ts for s in subs)) if t is not None]
+    with jax.numpy_dtype_promotion("standard"):
+        dtype = jnp.result_type(*times)
+        return dtype if jnp.issubdtype(dtype, jnp.floating) else jnp.result_type(float)
+
+
+def _as_state(y0: Y, time_dtype: Any) -> Y:
+    check_state(y0, "y0")
+    with jax.numpy_dtype_promotion("standard"):
+        return jtu.tree_map(lambda leaf: jnp.asarray(leaf, jnp.result_type(leaf, time_dtype)), y0)
+
+
+def _first_step(terms, solver, t0, t1, y0, args, controller) -> Any:
+    tolerances = controller_tolerances(controller)
+    if tolerances is None or not isinstance(terms, dfx.ODETerm | DirectedTerm):
+        return None
+    return initial_step(terms, solver, t0, t1, y0, args, tolerances)
