@@ -10,7 +10,7 @@ import jax.tree_util as jtu
 from diffrax import RESULTS
 
 from .._chart import AbstractChart, AbstractCoordinates, TangentSpaceChart
-from .._compat import time_direction
+from .._compat import is_sde, time_direction
 from .._constraint import AbstractConstraint
 from .._constraint_checks import check_constraint
 from .._custom_types import Args, BoolScalar, RealScalarLike, Y
@@ -90,6 +90,11 @@ class LocalCoordinates(AbstractManifoldSolver):
 
     def init(self, terms, t0: RealScalarLike, t1: RealScalarLike, y0: Y, args: Args) -> HookState:
         check_noise(self.solver, terms)
+        if self.chart.state is not None and is_sde(terms):
+            raise ValueError(
+                f"`terms` has noise, which coordinates of `chart={type(self.chart).__name__}` are not for. Use "
+                "`mj.Projected(solver, constraint)`."
+            )
         check_constraint(self.constraint, t0, y0, args)
         execution = execution_of(self.inner, terms, t0, t1, y0, args)
         frame = self._coordinates(terms, t0, y0, args).frame(terms, t1, args, self.chart.state)
