@@ -1,9 +1,25 @@
-"""Compiled as users compile: what depends on how XLA rounds does not show without optimization, with
-which the other tests run."""
+"""How programs are compiled. The tests check numbers, not speed, and compiling is most of their
+time: without optimization it takes a third. What depends on how XLA rounds does not show that way;
+such tests compile as users do, with `optimized_jit`."""
 
 import functools
+import importlib.metadata
 
 import jax
 
 
-optimized_jit = functools.partial(jax.jit, compiler_options={"xla_backend_optimization_level": 3})
+# Name, value for the tests, and what users have.
+OPTIONS = {
+    "xla_backend_optimization_level": (0, 3),
+    "xla_llvm_disable_expensive_passes": (True, False),
+    "xla_cpu_parallel_codegen_split_count": (1, 32),
+}
+# Gone in later versions, where an unknown flag ends the process.
+if tuple(map(int, importlib.metadata.version("jaxlib").split(".")[:2])) < (0, 11):
+    OPTIONS["xla_cpu_use_fusion_emitters"] = (False, True)
+
+FAST_FLAGS = " ".join(f"--{name}={str(fast).lower()}" for name, (fast, _) in OPTIONS.items())
+
+optimized_jit = functools.partial(
+    jax.jit, compiler_options={name: usual for name, (_, usual) in OPTIONS.items()}
+)
