@@ -14,18 +14,13 @@ DECAY = dfx.ODETerm(lambda t, y, rate: -rate * y)
 Y0 = jnp.array([1.0])
 
 
-def gradients(objective):
-    adjoints = mj.StepReplayAdjoint(), dfx.RecursiveCheckpointAdjoint()
-    return [
-        jax.jit(jax.grad(lambda r, adjoint=adjoint: objective(r, adjoint)))(RATE)
-        for adjoint in adjoints
-    ]
-
-
-def same(objective, rtol=1e-12):
-    replayed, reference = gradients(objective)
+def same(objective, rtol=1e-12, checkpoints=(None,)):
+    gradient = lambda adjoint: jax.jit(jax.grad(lambda r: objective(r, adjoint)))(RATE)
+    reference = gradient(dfx.RecursiveCheckpointAdjoint())
     assert abs(reference) > 1e-3
-    np.testing.assert_allclose(replayed, reference, rtol=rtol)
+    for number in checkpoints:
+        replayed = gradient(mj.StepReplayAdjoint(checkpoints=number))
+        np.testing.assert_allclose(replayed, reference, rtol=rtol)
 
 
 def weighted(ys):
@@ -71,7 +66,7 @@ def jumping(saveat, solver, rtol, factor, t0=0.0, dt0=0.1):
 
 def test_a_time_saved_at_a_jump():
     """The step behind it is rejected first."""
-    same(jumping(dfx.SaveAt(ts=jnp.array([0.5])), dfx.Tsit5(), 1e-4, 300.0))
+    same(jumping(dfx.SaveAt(ts=jnp.array([0.5])), dfx.Bosh3(), 1e-4, 300.0))
 
 
 def test_a_function_saved_at_the_end_of_a_step_before_a_jump():
@@ -88,16 +83,15 @@ def test_stages_at_the_end_of_a_step_are_not_behind_the_jump():
 
 
 @pytest.mark.parametrize("solver", [dfx.LeapfrogMidpoint(), dfx.ReversibleHeun()], ids=str)
-@pytest.mark.parametrize("checkpoints", [None, 4], ids=["all states", "some states"])
-def test_what_solvers_remember_is_part_of_the_state(solver, checkpoints):
+def test_what_solvers_remember_is_part_of_the_state(solver):
+    """With all states recorded, and with some of them."""
+
     def objective(rate, adjoint):
-        if isinstance(adjoint, mj.StepReplayAdjoint):
-            adjoint = mj.StepReplayAdjoint(checkpoints)
         options = dict(saveat=dfx.SaveAt(ts=jnp.linspace(0.0, 1.0, 5)), adjoint=adjoint)
         sol = dfx.diffeqsolve(DECAY, solver, 0.0, 1.0, 0.05, Y0, rate, max_steps=30, **options)
         return weighted(sol.ys)
 
-    same(objective)
+    same(objective, checkpoints=(None, 4))
 
 
 def test_a_time_dependent_constraint_with_times():

@@ -20,6 +20,7 @@ SAVED = dfx.SaveAt(t0=True, ts=jnp.array([0.1, 0.2, 0.5]), t1=True)
 
 
 def rotate(values, order=(0, 1), sign=1.0, hook=True, constraint=CIRCLE, **options):
+    """Backwards in time for a `sign` of -1."""
     conditions = [lambda t, y, args, **kwargs: y[0] - args[0]]
     conditions.append(lambda t, y, args, **kwargs: y[1] - args[1])
     return mj.diffeqsolve(
@@ -50,12 +51,12 @@ def test_the_earlier_of_two_events_in_one_step(order):
 
 
 def test_events_in_a_batch_and_backwards_in_time():
-    """Of the trajectories one has no event at all."""
-    many = jnp.array([[0.9, 0.3], [0.99, 0.5], [5.0, 5.0]])
-    ends = jax.jit(jax.vmap(lambda values: rotate(values).ts[0]))(many)
+    """Of the trajectories one has no event at all, and the last runs the other way."""
+    many = jnp.array([[0.9, 0.3], [0.99, 0.5], [5.0, 5.0], [0.9, -0.3]])
+    sign = jnp.array([1.0, 1.0, 1.0, -1.0])
+    *ends, back = jax.jit(jax.vmap(lambda v, sign: rotate(v, sign=sign).ts[0]))(many, sign)
     np.testing.assert_allclose(ends, [np.arcsin(0.3), np.arccos(0.99), 3.0], atol=1e-3)
-    back = rotate(jnp.array([0.9, -0.3]), sign=-1.0)
-    np.testing.assert_allclose(back.ts[0], -ends[0], rtol=1e-9)
+    np.testing.assert_allclose(back, -ends[0], rtol=1e-9)
 
 
 @pytest.mark.parametrize("hook", [True, False])
