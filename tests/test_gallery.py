@@ -105,18 +105,11 @@ class Case:
 
     @functools.cached_property
     def event_function(self):
-        """Where some component of y crosses the middle of its range on the reference run."""
-        sol = mj.diffeqsolve(
-            self.terms,
-            mj.Projected(dfx.Tsit5(), self.constraint),
-            self.t0,
-            self.t1,
-            None,
-            self.y0,
-            saveat=dfx.SaveAt(ts=jnp.linspace(self.t0, self.t1, 101)),
-            **self.options("tsit5"),
-        )
-        ys = np.asarray(jax.vmap(lambda y: jfu.ravel_pytree(y)[0])(sol.ys))
+        """Where some component of y crosses the middle of its range, or of the ends where nothing
+        else is known."""
+        times = [self.t1] if self.end_only else np.linspace(self.t0, self.t1, 101)
+        states = [self.y0, *(self.reference(t) for t in times)]
+        ys = np.stack([np.concatenate([np.ravel(x) for x in jax.tree.leaves(y)]) for y in states])
         j = int(np.argmax(np.ptp(ys, axis=0)))
         middle = 0.5 * (ys[:, j].min() + ys[:, j].max())
 
