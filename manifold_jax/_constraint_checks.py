@@ -95,6 +95,7 @@ def check_constraint(constraint: AbstractConstraint, t: RealScalarLike, y: Y, ar
     if m > n and not constraint.redundant:
         raise ValueError(
             f"`constraint` returned {m} residuals for a state of {n} numbers; at most {n} independent "
-            "equations can hold. Remove dependent rows (of a symmetric matrix equation keep the upper triangle)."
+            "equations can hold. Remove dependent rows (of a symmetric matrix equation keep the upper triangle), "
+            "or pass `redundant=True`."
         )
     return m

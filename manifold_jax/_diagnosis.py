@@ -16,8 +16,8 @@ _MESSAGES = (
     "`constraint` is not finite at the time and state given. Start from a state at which g(t, {y}, args) is "
     "defined.",
     "The Jacobian dg/dy of `constraint` does not have full rank at `{y}`: an equation ignores y, depends on the "
-    "others (redundant), or `{y}` is a singular point. Remove dependent equations (or, for an "
-    "`mj.MechanicalSystem`, pass `redundant=True`), or start elsewhere.",
+    "others (redundant), or `{y}` is a singular point. Remove dependent equations (or pass "
+    "`redundant=True`), or start elsewhere.",
     "`{y}` could not be made consistent with `constraint`: no nearby state satisfies g(t, y, args) = 0. Start "
     "closer to the manifold, or check that the equations can hold at the same time.",
     '`{y}` is not on the manifold. Write `consistent="project"` to have it moved there, or correct it first with '

@@ -33,7 +33,7 @@ def polar(Y):
 
 @pytest.mark.parametrize("shape", [(3, 3), (5, 2), (10, 9)])
 def test_the_nearest_matrix_is_the_polar_factor(shape):
-    Y = nearby(1, 3e-2, shape)
+    Y = nearby(1, 1e-2, shape)
     p, info = mj.Stiefel().correct(NEWTON, 0.0, Y)
     np.testing.assert_allclose(p, polar(Y), rtol=0, atol=2e-15)
     assert info.success

@@ -106,7 +106,10 @@ def test_contradictions_and_unannounced_redundancy_are_reported():
     contradicting = lambda t, y, args: jnp.stack([y @ y - 1, y @ y - 2])
     with pytest.raises(RuntimeError, match="could not be made consistent"):
         mj.project(mj.Constraint(contradicting, redundant=True), 0.0, jnp.array([1.0, 0.5]))
+    doubled = lambda t, y, args: twice(t, y, args)[:2]
     with pytest.raises(RuntimeError, match="redundant"):
+        mj.project(mj.Constraint(doubled), 0.0, jnp.array([0.9, 0.2, 0.5]))
+    with pytest.raises(ValueError, match="`redundant=True`"):
         mj.project(mj.Constraint(twice), 0.0, jnp.array([0.9, 0.2, 0.5]))
     with pytest.raises(ValueError, match="`constraint` is redundant"):
         mj.LocalCoordinates(dfx.Tsit5(), mj.Constraint(twice, redundant=True))

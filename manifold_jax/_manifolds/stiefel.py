@@ -60,14 +60,15 @@ class Stiefel(mj.AbstractConstraint):
             success = finite & (self._residual(there) <= projection.tolerance_for(y.dtype))
         else:
             polar = _polar
-            success = finite & (self._residual(y) * y.shape[1] <= _CONVERGES)
+            deviation = _gram(y) - jnp.eye(y.shape[1], dtype=y.dtype)
+            success = finite & (jnp.sum(deviation**2) <= _CONVERGES**2)
         # Replaced where it fails before it is differentiated: iterations that diverge overflow.
         x = jnp.where(success, y, safe)
         p = polar(x)
         # On the manifold to rounding already the point stays as it is, but not its derivative.
         there = self._residual(x) <= 2 * jnp.finfo(y.dtype).eps
         p = jnp.where(success, jnp.where(there, p + jax.lax.stop_gradient(x - p), p), y)
-        residual = jnp.where(finite, self._residual(p), jnp.nan)
+        residual = jnp.where(finite, self._residual(jax.lax.stop_gradient(p)), jnp.nan)
         return p, mj.ProjectionInfo.of_formula(y, p, residual, success)
 
     def _residual(self, y: Float[Array, "n k"]) -> Float[Array, ""]:
