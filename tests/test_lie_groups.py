@@ -104,7 +104,7 @@ def test_order(name, coordinates):
         flat, (0, 3), np.ravel(y0), method="DOP853", rtol=3e-14, atol=1e-15
     ).y[:, -1]
     chart = mj.LieGroupChart(group, coordinates)
-    for solver, order in SOLVERS[:2] + [SOLVERS[3 if name == "quaternion" else 2]]:
+    for solver, order in [*SOLVERS[:2], SOLVERS[3 if name == "quaternion" else 2]]:
         hook = mj.LocalCoordinates(solver, constraint, chart=chart)
 
         @jax.jit
