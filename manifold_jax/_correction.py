@@ -14,7 +14,15 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ._custom_types import Args, BoolScalar, FloatScalar, IntScalar, RealScalarLike, Y
-from ._linear import combine, Factorization, factorize, gram, pseudo_invert, PseudoInverse
+from ._linear import (
+    combine,
+    Factorization,
+    factorize_once,
+    gram,
+    Inverse,
+    pseudo_invert,
+    PseudoInverse,
+)
 from ._newton import AbstractEquations, chord, damped_newton, implicit_tangent
 from ._projection import NewtonProjection
 from ._residual import as_time, jacobian, residual_vector, row_scale
@@ -33,14 +41,14 @@ class Crossing(NamedTuple):
     """The normals at a point with `G V` factored: the linearization of a correction."""
 
     normals: Normals
-    factorization: Factorization | PseudoInverse
+    factorization: Factorization | Inverse | PseudoInverse
 
     @staticmethod
     def of(normals: Normals, redundant: bool, dependent: FloatScalar | float = 1e-4) -> "Crossing":
         """`dependent` as in `pseudo_invert`, for `redundant` equations."""
         A = gram(*normals)
         if not redundant:
-            return Crossing(normals, factorize(A))
+            return Crossing(normals, factorize_once(A))
         return Crossing(normals, pseudo_invert(A, equilibrated=True, dependent=dependent))
 
     def solve(self, b: Float[Array, " m"]) -> Float[Array, " m"]:

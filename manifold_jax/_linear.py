@@ -11,6 +11,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.scipy.linalg as jsl
+import numpy as np
 from jaxtyping import Array, Float
 
 from ._custom_types import BoolScalar, FloatScalar
@@ -30,24 +31,97 @@ class Factorization(eqx.Module):
     `W^-1 G^T`, or mass matrices, hence close to symmetric positive definite. Where the rank
     is not full the solution is finite but meaningless: its derivative must not be NaN, as
     the zero cotangent of a rejected step would turn into NaN, too.
+
+    The derivative is that of `A x = b`, not of the elimination: five times less to compile.
     """
 
-    lu: list[list[Float[Array, ""]]] | tuple[Float[Array, "m m"], Array]
+    A: Float[Array, "m m"]
+    lu: list[list[Float[Array, ""]]] | tuple[Float[Array, "m m"], Array]  # held fixed
     full_rank: BoolScalar
 
     def solve(self, b: Float[Array, "m ..."]) -> Float[Array, "m ..."]:
-        if not isinstance(self.lu, list):
-            return jsl.lu_solve(self.lu, b)
-        m = len(self.lu)
-        x = [b[i] for i in range(m)]
-        for i in range(m):
-            for k in range(i):
-                x[i] = x[i] - self.lu[i][k] * x[k]
-        for i in reversed(range(m)):
-            for k in range(i + 1, m):
-                x[i] = x[i] - self.lu[i][k] * x[k]
-            x[i] = x[i] / self.lu[i][i]
-        return jnp.stack(x)
+        return _solve(self.A, self.lu, b)
+
+
+@jax.custom_jvp
+def _solve(A: Float[Array, "m m"], lu: Any, b: Float[Array, "m ..."]) -> Float[Array, "m ..."]:
+    del A
+    if not isinstance(lu, list):
+        return jsl.lu_solve(lu, b)
+    m = len(lu)
+    x = [b[i] for i in range(m)]
+    for i in range(m):
+        for k in range(i):
+            x[i] = x[i] - lu[i][k] * x[k]
+    for i in reversed(range(m)):
+        for k in range(i + 1, m):
+            x[i] = x[i] - lu[i][k] * x[k]
+        x[i] = x[i] / lu[i][i]
+    return jnp.stack(x)
+
+
+@_solve.defjvp
+def _solve_jvp(primals, tangents):
+    (A, lu, b), (A_dot, _, b_dot) = primals, tangents
+    x = _solve(A, lu, b)
+    return x, _solve(A, lu, b_dot - _product(A_dot, x))
+
+
+class Inverse(eqx.Module):
+    """`A^-1` by Gauss-Jordan elimination without pivoting, the whole matrix in one array: fewer and
+    larger operations than those of [`Factorization`][], of which a program is compiled in less
+    time. For what is evaluated once in a step; at stages the elimination is faster."""
+
+    inverse: Float[Array, "m m"]
+    full_rank: BoolScalar
+
+    def solve(self, b: Float[Array, "m ..."]) -> Float[Array, "m ..."]:
+        return _product(self.inverse, b)
+
+
+# Rows from which on the inverse pays.
+_SMALLEST_INVERSE = 3
+
+
+def factorize_once(A: Float[Array, "m m"]) -> "Factorization | Inverse":
+    """For what is evaluated once in a step, or in a solve."""
+    if not _SMALLEST_INVERSE <= A.shape[0] <= UNROLL_LIMIT:
+        return factorize(A)
+    return Inverse(*_invert(A))
+
+
+@jax.custom_jvp
+def _invert(A: Float[Array, "m m"]) -> tuple[Float[Array, "m m"], BoolScalar]:
+    """And whether the rank was full, as in [`factorize`][]."""
+    m = A.shape[0]
+    rows, diagonal = jnp.arange(m), jnp.abs(jnp.diagonal(A))
+    full_rank = jnp.asarray(True)
+    for k in range(m):
+        accepted = A[k, k] > _threshold(A) * diagonal[k]
+        full_rank &= accepted
+        row = jnp.where(rows == k, 1, A[k]) / jnp.where(accepted, A[k, k], 1)
+        others = jnp.where((rows == k)[None, :], 0, A) - A[:, k][:, None] * row[None, :]
+        A = jnp.where((rows == k)[:, None], row[None, :], others)
+    return A, full_rank
+
+
+@_invert.defjvp
+def _invert_jvp(primals, tangents):
+    (A,), (A_dot,) = primals, tangents
+    X, full_rank = _invert(A)
+    no_tangent = np.zeros((), jax.dtypes.float0)
+    return (X, full_rank), (-_product(_product(X, A_dot), X), no_tangent)
+
+
+def _threshold(A: Float[Array, "m m"]) -> float:
+    return 10 * A.shape[0] * float(jnp.finfo(A.dtype).eps)
+
+
+def _product(A: Float[Array, "i j"], B: Float[Array, "j ..."]) -> Float[Array, "i ..."]:
+    """`A B`; small ones as a sum that fuses, as batched tiny `dot`s are slow."""
+    if A.shape[0] > UNROLL_LIMIT:
+        return jnp.tensordot(A, B, axes=1)
+    return jnp.sum(A.reshape(*A.shape, *(1,) * (B.ndim - 1)) * B[None], axis=1)
 
 
 class PseudoInverse(eqx.Module):
@@ -73,24 +147,23 @@ def factorize(
     for a Gram matrix `A = G W^-1 G^T` that ratio is the squared sine of the angle between
     one row of `G` and the span of those before it, and rounding leaves about `eps` of it.
     """
-    m = A.shape[0]
-    if threshold is None:
-        threshold = 10 * m * float(jnp.finfo(A.dtype).eps)
     if redundant:
         return pseudo_invert(A)
+    threshold = _threshold(A) if threshold is None else threshold
+    m, fixed = A.shape[0], jax.lax.stop_gradient(A)
     if m > UNROLL_LIMIT:
         return _factorize_with_library(A, threshold)
-    lu = [[A[i, j] for j in range(m)] for i in range(m)]
+    lu = [[fixed[i, j] for j in range(m)] for i in range(m)]
     full_rank = jnp.asarray(True)
     for k in range(m):
-        accepted = lu[k][k] > threshold * jnp.abs(A[k, k])
+        accepted = lu[k][k] > threshold * jnp.abs(fixed[k, k])
         full_rank &= accepted
         lu[k][k] = jnp.where(accepted, lu[k][k], 1)
         for i in range(k + 1, m):
             lu[i][k] = lu[i][k] / lu[k][k]
             for j in range(k + 1, m):
                 lu[i][j] = lu[i][j] - lu[i][k] * lu[k][j]
-    return Factorization(lu, full_rank)
+    return Factorization(A, lu, full_rank)
 
 
 # Equations that depend on each other on the manifold do so only nearly at a stage beside it:
@@ -120,7 +193,7 @@ def _factorize_with_library(A: Float[Array, "m m"], threshold: float) -> Factori
     equilibrated, _ = jsl.lu_factor(jax.lax.stop_gradient(A / size[:, None] / size[None, :]))
     full_rank = jnp.all(jnp.abs(jnp.diagonal(equilibrated)) > threshold)
     A = jnp.where(full_rank, A, jnp.eye(A.shape[0], dtype=A.dtype))
-    return Factorization(jsl.lu_factor(A), full_rank)
+    return Factorization(A, jsl.lu_factor(jax.lax.stop_gradient(A)), full_rank)
 
 
 def gram(A: Float[Array, "i n"], B: Float[Array, "k n"]) -> Float[Array, "i k"]:

@@ -81,6 +81,11 @@ class _Search(NamedTuple):
 _ROUNDING = 0.5
 
 
+# Equations up to which iterations are written out. With more of them the loop runs as fast and
+# compiles in less time.
+_WRITTEN_OUT = 2
+
+
 def chord(
     equations: AbstractEquations,
     linearization: Linearization,
@@ -90,12 +95,13 @@ def chord(
     max_steps: int,
 ) -> Iterate:
     """Simplified Newton from `z` with residual `r`: one factorization throughout. Two iterations
-    are nearly always enough, and are written out so that they fuse with what is around them.
+    are nearly always enough, and for few equations are written out, so that they fuse with what is
+    around them.
 
     A point that is a root to rounding stays where it is: a correction of that size is
     large for a component that is small."""
     search = _Search(equations, scale)
-    written_out = min(2, max_steps)
+    written_out = min(2, max_steps) if r.size <= _WRITTEN_OUT else 0
     rounding = _ROUNDING * jnp.finfo(r.dtype).eps
     level = search.level(r)
     needed = level > rounding

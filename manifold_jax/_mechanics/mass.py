@@ -113,4 +113,4 @@ def _factorize_positive(M: Float[Array, "n n"], threshold: float | None = None) 
     lower = jnp.linalg.cholesky(jax.lax.stop_gradient(M / size[:, None] / size[None, :]))
     positive = jnp.all(jnp.diagonal(lower) ** 2 > threshold)  # NaN unless positive definite
     factorization = factorize(jnp.where(positive, M, jnp.eye(M.shape[0], dtype=M.dtype)))
-    return Factorization(factorization.lu, positive)
+    return Factorization(factorization.A, factorization.lu, positive)
