@@ -107,9 +107,9 @@ class Case:
     def event_function(self):
         """Where some component of y crosses the middle of its range, or of the ends where nothing
         else is known."""
-        times = [self.t1] if self.end_only else np.linspace(self.t0, self.t1, 101)
-        states = [self.y0, *(self.reference(t) for t in times)]
-        ys = np.stack([np.concatenate([np.ravel(x) for x in jax.tree.leaves(y)]) for y in states])
+        times = np.array([self.t1]) if self.end_only else np.linspace(self.t0, self.t1, 101)
+        both = jax.tree.map(lambda a, b: np.r_[a[None], b], self.y0, self.reference(times))
+        ys = np.concatenate([np.reshape(x, (len(x), -1)) for x in jax.tree.leaves(both)], axis=1)
         j = int(np.argmax(np.ptp(ys, axis=0)))
         middle = 0.5 * (ys[:, j].min() + ys[:, j].max())
 
