@@ -40,12 +40,17 @@ class Factorization(eqx.Module):
     full_rank: BoolScalar
 
     def solve(self, b: Float[Array, "m ..."]) -> Float[Array, "m ..."]:
-        return _solve(self.A, self.lu, b)
+        A, lu = self.A, self.lu
+        return jax.lax.custom_linear_solve(
+            lambda x: _product(A, x),
+            b,
+            lambda _, b: _substitute(lu, b),
+            lambda _, b: _substitute_transposed(lu, b),
+        )
 
 
-@jax.custom_jvp
-def _solve(A: Float[Array, "m m"], lu: Any, b: Float[Array, "m ..."]) -> Float[Array, "m ..."]:
-    del A
+def _substitute(lu: Any, b: Float[Array, "m ..."]) -> Float[Array, "m ..."]:
+    """`(L U)^-1 b`."""
     if not isinstance(lu, list):
         return jsl.lu_solve(lu, b)
     m = len(lu)
@@ -60,11 +65,20 @@ def _solve(A: Float[Array, "m m"], lu: Any, b: Float[Array, "m ..."]) -> Float[A
     return jnp.stack(x)
 
 
-@_solve.defjvp
-def _solve_jvp(primals, tangents):
-    (A, lu, b), (A_dot, _, b_dot) = primals, tangents
-    x = _solve(A, lu, b)
-    return x, _solve(A, lu, b_dot - _product(A_dot, x))
+def _substitute_transposed(lu: Any, b: Float[Array, "m ..."]) -> Float[Array, "m ..."]:
+    """`(U^T L^T)^-1 b`."""
+    if not isinstance(lu, list):
+        return jsl.lu_solve(lu, b, trans=1)
+    m = len(lu)
+    x = [b[i] for i in range(m)]
+    for i in range(m):
+        for k in range(i):
+            x[i] = x[i] - lu[k][i] * x[k]
+        x[i] = x[i] / lu[i][i]
+    for i in reversed(range(m)):
+        for k in range(i + 1, m):
+            x[i] = x[i] - lu[k][i] * x[k]
+    return jnp.stack(x)
 
 
 class Inverse(eqx.Module):

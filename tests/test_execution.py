@@ -1,0 +1,95 @@
+"""The ways to execute a step, held against each other: they may differ by rounding alone."""
+
+import diffrax as dfx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import manifold_jax as mj
+from manifold_jax._solver.execution import CarriedDerivative, execution_of, OwnStep, WrittenOut
+from manifold_jax._solver.frame import Frame
+
+
+CIRCLE = mj.Constraint(lambda t, y, args: y["x"] @ y["x"] - 1.0)
+T0, T1, T2 = jnp.asarray([0.0, 0.3, 0.5])
+SPEED = jnp.asarray(1.3)
+START = {"x": jnp.array([0.6, 0.8])}
+
+
+def field(t, y, args):
+    x = y["x"]
+    return {"x": args * (1 + t) * jnp.stack([-x[1], x[0]])}
+
+
+TERM = dfx.ODETerm(field)
+EXPLICIT = [dfx.Heun(), dfx.Bosh3(), dfx.Tsit5(), dfx.Dopri8()]
+IMPLICIT = [dfx.Kvaerno3(), dfx.Kvaerno5()]
+TIGHT = dfx.VeryChord(rtol=1e-12, atol=1e-12)
+
+
+def unchanged(y):
+    return y, mj.ProjectionInfo.of_nothing(y, jnp.asarray(True))
+
+
+def two_steps(execution, jump, corrected):
+    """The second begins where the first ended, behind a jump of the field if there is one."""
+
+    def frame(t1, y0):
+        if not corrected:
+            return Frame.of_state(y0, TERM, unchanged)
+        correct = lambda y: CIRCLE.correct(mj.NewtonProjection(), t1, y, None, fallback=y0)
+        return Frame.of_state(y0, TERM, correct)
+
+    def run(speed):
+        first = frame(T1, START)
+        memory = execution.initial_memory(TERM, first, T0, T1, START, speed)
+        one = execution.step(TERM, first, T0, T1, START, speed, memory, False)
+        speed = jnp.where(jump, 2 * speed, speed)
+        second = frame(T2, one.y1)
+        two = execution.step(TERM, second, T1, T2, one.y1, speed, one.memory, jump)
+        return [(s.y1, s.raw, s.error, s.dense_info, s.info.success) for s in (one, two)]
+
+    value = lambda speed: run(speed)[1][0]["x"][0]
+    return jax.jit(lambda s: (run(s), jax.grad(value)(s)))(SPEED)
+
+
+def check_equal(ways, jump, corrected, accuracy):
+    first, *others = (two_steps(way, jump, corrected) for way in ways)
+    for other in others:
+        jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=accuracy), first, other)
+
+
+@pytest.mark.parametrize("jump", [False, True])
+@pytest.mark.parametrize("solver", EXPLICIT, ids=lambda s: type(s).__name__)
+def test_explicit_steps(solver, jump):
+    """Stage by stage, in a loop, and Diffrax's own. Of methods whose last stage is the first one of
+    the next step ours is taken at the corrected state, which Diffrax has not got: there the ways
+    are compared with nothing to correct."""
+    assert isinstance(execution_of(solver, TERM, T0, T1, START, SPEED), WrittenOut)
+    check_equal([WrittenOut(solver, False), WrittenOut(solver, True)], jump, True, 1e-15)
+    frame = Frame.of_state(START, TERM, unchanged)
+
+    def step(way):
+        memory = way.initial_memory(TERM, frame, T0, T1, START, SPEED)
+        return way.step(TERM, frame, T0, T1, START, SPEED, memory, False)
+
+    ours, diffrax = step(WrittenOut(solver)), step(OwnStep(solver))
+    for name in ("y1", "raw", "error", "dense_info"):
+        same = lambda a, b: np.testing.assert_allclose(a, b, atol=1e-15)
+        jax.tree.map(same, getattr(ours, name), getattr(diffrax, name))
+
+
+@pytest.mark.parametrize("jump", [False, True])
+@pytest.mark.parametrize("solver", IMPLICIT, ids=lambda s: type(s).__name__)
+def test_implicit_steps(solver, jump):
+    """The derivative that is carried is that of the stage, before its correction: the ways agree
+    where there is none, and behind a jump, as accurately as stages are solved."""
+    solver = type(solver)(root_finder=TIGHT)
+    assert isinstance(execution_of(solver, TERM, T0, T1, START, SPEED), CarriedDerivative)
+    check_equal([CarriedDerivative(solver), OwnStep(solver)], jump, jump, 1e-4)
+
+
+def test_what_has_no_other_way_makes_its_own_step():
+    for solver in (dfx.HalfSolver(dfx.Heun()), dfx.ImplicitEuler(), dfx.EulerHeun()):
+        assert isinstance(execution_of(solver, TERM, T0, T1, START, SPEED), OwnStep)
