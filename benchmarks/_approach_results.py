@@ -91,7 +91,8 @@ def prepare(
         if name in scipy_methods:
             candidates[name] = OfScipy.prepare(problem, scipy_methods[name])
             continue
-        if approaches[name].needs_system and problem.system is None:
+        needs = approaches[name].needs
+        if needs is not None and not needs.is_met_by(problem):
             continue
         try:
             candidates[name] = OfDiffrax.prepare(problem, approaches[name], SOLVERS[solver]())

@@ -2,7 +2,6 @@
 
 from importlib.metadata import version
 
-from . import problems as problems
 from ._adjoint import StepReplayAdjoint as StepReplayAdjoint
 from ._applications import (
     ConstrainedMinimum as ConstrainedMinimum,
@@ -59,6 +58,10 @@ from ._manifolds import (
     Sphere as Sphere,
     Stiefel as Stiefel,
 )
+
+
+# isort: split
+from . import problems as problems
 
 
 __version__ = version("manifold_jax")

@@ -1,3 +1,4 @@
+import dataclasses
 import json
 import math
 import re
@@ -13,7 +14,7 @@ from typer.testing import CliRunner
 import manifold_jax as mj
 from manifold_jax import problems
 from manifold_jax._cli import app
-from manifold_jax._compare import figure, methods, paper, report, with_diffrax
+from manifold_jax._compare import approaches, figure, methods, paper, report, with_diffrax
 from manifold_jax._compare.task import SolveFailed, Task
 
 
@@ -103,7 +104,10 @@ def test_compare_writes_the_table_as_json(comparison):
     assert settings["max_steps"] == 4096
     assert settings["output_points"] == 1001
     assert settings["failures"] == {}
-    assert settings["left_out"] == {"baumgarte tsit5": "needs a mechanical system"}
+    assert settings["left_out"] == {
+        "baumgarte tsit5": "needs a mechanical system",
+        "lie-group tsit5": "needs a chart of its own",
+    }
     approaches = ["plain", "projected", "one-step", "invariant", "exact", "tangent", "partition"]
     names = [f"{approach} tsit5" for approach in approaches]
     names += ["scipy RK45", "scipy DOP853", "scipy LSODA"]
@@ -354,6 +358,29 @@ def test_every_method_is_in_the_help_and_has_a_style():
     assert len(set(figure.STYLES.values())) == len(names)
 
 
+def test_approaches_of_other_packages_are_found(monkeypatch):
+    class Point:
+        name = "mine"
+
+        def load(self):
+            return dataclasses.replace(approaches.APPROACHES[0], name="mine")
+
+    found = lambda group: [Point()] if group == "manifold_jax.approaches" else []
+    monkeypatch.setattr(approaches, "entry_points", found)
+    assert [approach.name for approach in approaches._of_other_packages()] == ["mine"]
+
+
+def test_an_approach_for_some_problems(tmp_path):
+    """The exact chart of rotations: one turn is exact to rounding."""
+    path = tmp_path / "rows.json"
+    result = run("compare", "rotation", "--methods", "lie-group", "--json", path)
+    assert result.exit_code == 0, result.output
+    (row,) = strict_json(path)["rows"]
+    assert row["method"] == "lie-group tsit5"
+    assert row["error"] < 1e-12
+    assert row["violation_output"] < 1e-15
+
+
 # errors
 
 
@@ -368,8 +395,8 @@ def test_every_method_is_in_the_help_and_has_a_style():
         (("pendulum", "--atol", "nan"), "must be a positive number, got nan"),
         (("pendulum", "--gain", "0"), "must be a positive number, got 0.0"),
         (("pendulum", "--methods", "plain,rattle"), "there is no method 'rattle'. Choose one of"),
-        (("pendulum", "--methods", ""), "partition, scipy-rk45, scipy-dop853, scipy-lsoda"),
-        (("kepler", "--methods", "baumgarte"), "mechanical system, which `kepler` is not"),
+        (("pendulum", "--methods", ""), "partition, lie-group, scipy-rk45, scipy-dop853, scipy-lsoda"),
+        (("kepler", "--methods", "baumgarte"), "mechanical system, which `kepler` has not"),
         (("pendulum", "--t1", "0"), "must be later than the start of `pendulum`, t0 = 0"),
         (("arevalo", "--t1", "0.5"), "t0 = 1; got 0.5"),
         (("pendulum", "--plot", "picture.gif"), "must end in one of: .png"),

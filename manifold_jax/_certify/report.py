@@ -8,7 +8,7 @@ from typing import Any
 
 from rich.table import Table
 
-from .._compare.report import NEEDS_SYSTEM
+from .._compare.approaches import Approach
 from .checks import ADJOINTS, Check, Combination, ONCE, REFUSED
 
 
@@ -67,7 +67,7 @@ def certificate_notes(combination: Combination) -> list[str]:
 
 
 def certificate_scope(
-    combinations: Sequence[Combination], missing: Sequence[str], left_out: Sequence[str]
+    combinations: Sequence[Combination], missing: Sequence[str], left_out: Sequence[Approach]
 ) -> list[str]:
     """How to read the certificate, and what it is silent about: the `missing` methods and
     whatever else could have been asked for; those `left_out` cannot solve the problem."""
@@ -85,7 +85,7 @@ def certificate_scope(
     return [
         "Adjoints: largest relative difference from forward mode, steps chosen anew in each solve; "
         "batch: vmap for two sets of parameters.",
-        *(f"Left out: {name}, which {NEEDS_SYSTEM}." for name in left_out),
+        *(f"Left out: {each.name}, which {each.needs}." for each in left_out),
         f"Not covered: {'; '.join(silent)}.",
     ]
 

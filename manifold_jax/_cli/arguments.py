@@ -51,10 +51,11 @@ def choose(
     """Of the methods asked for, those that can solve the task, and those that cannot."""
     asked = list(known) if names is None else names_in(names, known, "method", "--methods")
     methods = [method for name, method in known.items() if name in asked]
-    chosen = [m for m in methods if task.problem.system is not None or not m.needs_system]
+    chosen = [m for m in methods if m.needs is None or m.needs.is_met_by(task.problem)]
     if not chosen:
+        needs = " and ".join(dict.fromkeys(str(method.needs) for method in methods))
         raise typer.BadParameter(
-            f"{', '.join(asked)} needs a mechanical system, which `{task.problem.name}` is not.",
+            f"{', '.join(asked)} {needs}, which `{task.problem.name}` has not.",
             param_hint="--methods",
         )
     return chosen, [method for method in methods if method not in chosen]

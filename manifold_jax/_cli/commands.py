@@ -61,7 +61,7 @@ def compare(
         typer.Option(
             metavar="NAME,...",
             help="Only these: plain, projected, one-step, invariant, exact, baumgarte, tangent, "
-            "partition, scipy-rk45, scipy-dop853, scipy-lsoda.",
+            "partition, lie-group, scipy-rk45, scipy-dop853, scipy-lsoda.",
         ),
     ] = None,
     rtol: Annotated[float, typer.Option(help="Relative tolerance of all methods.")] = 1e-6,
@@ -97,7 +97,8 @@ def compare(
     The approaches: `plain` ignores the constraint; `projected` corrects every step to
     round-off, `one-step` by one Newton iteration; `invariant`, `exact` and `baumgarte` stabilize
     the vector field (the last for mechanical systems only); `tangent` and `partition` integrate
-    in local coordinates, of the tangent space and of some of the components.
+    in local coordinates, of the tangent space and of some of the components, `lie-group` in the
+    algebra (for rotations).
 
     The step limit that Diffrax needs is found automatically: 4096, doubled until the solve
     finishes, at most 1048576. It is stated below the table. A method that fails is reported
@@ -145,8 +146,8 @@ def certify(
         str,
         typer.Option(
             metavar="NAME,...",
-            help="plain, projected, one-step, invariant, exact, baumgarte, tangent, partition "
-            "(each takes its time, see above).",
+            help="plain, projected, one-step, invariant, exact, baumgarte, tangent, partition, "
+            "lie-group (each takes its time, see above).",
         ),
     ] = "projected",
     solvers: Annotated[
@@ -225,7 +226,7 @@ def certify(
         output.print()
     possible, _ = choose(None, known, task)
     missing = [approach.name for approach in possible if approach not in chosen]
-    for note in _certify.certificate_scope(rows, missing, [a.name for a in left_out]):
+    for note in _certify.certificate_scope(rows, missing, left_out):
         output.print(note, style="dim", highlight=False, markup=False)
     if not all(_certify.is_certified(row) for row in rows):
         raise typer.Exit(1)

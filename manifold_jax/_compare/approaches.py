@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable
+from importlib.metadata import entry_points
 from typing import Any, NamedTuple
 
 import diffrax as dfx
@@ -25,17 +26,50 @@ class Formulation(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True)
+class Need:
+    """What not every problem has: the attribute that is None then, and what it is called."""
+
+    attribute: str
+    phrase: str
+
+    def is_met_by(self, problem: Problem) -> bool:
+        return getattr(problem, self.attribute) is not None
+
+    def __str__(self) -> str:
+        return f"needs {self.phrase}"
+
+
+SYSTEM = Need("system", "a mechanical system")
+CHART = Need("chart", "a chart of its own")
+
+
+class Style(NamedTuple):
+    """How a curve is drawn: colour-blind safe (Okabe & Ito), related approaches share a hue."""
+
+    colour: str
+    line: str = "solid"
+
+
+@dataclasses.dataclass(frozen=True)
 class Approach:
-    """One way to keep a solution on (or near) a manifold.
+    """One way to keep a solution on (or near) a manifold: all that tables, pictures, certificates
+    and benchmarks know of it.
 
     - `name`: on the command line and in tables.
     - `formulate`: of a problem, a Diffrax solver and a gain (1/time, for stabilization).
-    - `needs_system`: whether the problem has to be a mechanical system.
+    - `style`: in pictures.
+    - `needs`: what a problem has to have, `None` if it is for all.
+    - `uses_gain`: whether the gain matters.
+
+    Those of other packages are found by the entry point group `manifold_jax.approaches`, each a
+    module-level `Approach`.
     """
 
     name: str
     formulate: Callable[[Problem, dfx.AbstractSolver, float], Formulation]
-    needs_system: bool = False
+    style: Style
+    needs: Need | None = None
+    uses_gain: bool = False
 
 
 def default_gain(problem: Problem) -> float:
@@ -95,16 +129,30 @@ def _partition(problem: Problem, solver: dfx.AbstractSolver, gain: float) -> For
     return Formulation(diffeqsolve, problem.terms, hook)
 
 
+def _lie_group(problem: Problem, solver: dfx.AbstractSolver, gain: float) -> Formulation:
+    del gain
+    assert problem.chart is not None
+    hook = LocalCoordinates(solver, problem.constraint, chart=problem.chart)
+    return Formulation(diffeqsolve, problem.terms, hook)
+
+
+def _of_other_packages() -> tuple[Approach, ...]:
+    found = entry_points(group="manifold_jax.approaches")
+    return tuple(point.load() for point in sorted(found, key=lambda point: point.name))
+
+
 # In the order of the tables.
 APPROACHES: tuple[Approach, ...] = (
-    Approach("plain", _plain),
-    Approach("projected", _projected),
-    Approach("one-step", _one_step),
-    Approach("invariant", _invariant),
-    Approach("exact", _exact),
-    Approach("baumgarte", _baumgarte, needs_system=True),
-    Approach("tangent", _tangent),
-    Approach("partition", _partition),
+    Approach("plain", _plain, Style("#D55E00")),
+    Approach("projected", _projected, Style("#0072B2")),
+    Approach("one-step", _one_step, Style("#56B4E9", "dashed")),
+    Approach("invariant", _invariant, Style("#009E73"), uses_gain=True),
+    Approach("exact", _exact, Style("#009E73", "dashed"), uses_gain=True),
+    Approach("baumgarte", _baumgarte, Style("#E69F00"), needs=SYSTEM, uses_gain=True),
+    Approach("tangent", _tangent, Style("#CC79A7")),
+    Approach("partition", _partition, Style("#CC79A7", "dashed")),
+    Approach("lie-group", _lie_group, Style("#CC79A7", "dotted"), needs=CHART),
+    *_of_other_packages(),
 )
 
 

@@ -11,24 +11,13 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from mpl_toolkits.mplot3d import Axes3D
 
-from .methods import Measurement
+from .approaches import Style
+from .methods import Measurement, METHODS
 from .task import Task
 
 
-# Colour-blind safe (Okabe & Ito); related approaches share a hue, black is the solution.
-STYLES: dict[str, tuple[str, Any]] = {
-    "plain": ("#D55E00", "solid"),
-    "projected": ("#0072B2", "solid"),
-    "one-step": ("#56B4E9", "dashed"),
-    "invariant": ("#009E73", "solid"),
-    "exact": ("#009E73", "dashed"),
-    "baumgarte": ("#E69F00", "solid"),
-    "tangent": ("#CC79A7", "solid"),
-    "partition": ("#CC79A7", "dashed"),
-    "scipy-rk45": ("#555555", "dotted"),
-    "scipy-dop853": ("#888888", "dotted"),
-    "scipy-lsoda": ("#BBBBBB", "dotted"),
-}
+# Black is the solution.
+STYLES: dict[str, Style] = {method.key: method.style for method in METHODS}
 # A violation or an error of exactly zero is drawn here.
 FLOOR = 1e-17
 # Curves show the largest value in each of so many intervals: rounding errors and changes of

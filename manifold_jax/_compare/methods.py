@@ -6,10 +6,13 @@ from collections.abc import Callable
 
 import numpy as np
 
-from .approaches import APPROACHES
+from .approaches import APPROACHES, Need, Style
 from .task import Run, SolveFailed, Task
 from .with_diffrax import run_diffrax
 from .with_scipy import run_scipy
+
+
+_BLACK = Style("#000000")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -18,12 +21,14 @@ class Method:
 
     - `label`: its name in tables, in which `{solver}` is the Diffrax solver asked for.
     - `run`: solves a task; raises `SolveFailed` if it cannot.
-    - `needs_system`: whether it is for mechanical systems only.
+    - `style`: in pictures.
+    - `needs`: as of an [`Approach`][].
     """
 
     label: str
     run: Callable[[Task], Run]
-    needs_system: bool = False
+    style: Style = _BLACK
+    needs: Need | None = None
 
     @property
     def key(self) -> str:
@@ -40,13 +45,16 @@ METHODS: tuple[Method, ...] = (
         Method(
             f"{approach.name} {{solver}}",
             functools.partial(run_diffrax, approach=approach),
-            approach.needs_system,
+            approach.style,
+            approach.needs,
         )
         for approach in APPROACHES
     ),
-    Method("scipy RK45", functools.partial(run_scipy, method="RK45")),
-    Method("scipy DOP853", functools.partial(run_scipy, method="DOP853")),
-    Method("scipy LSODA", functools.partial(run_scipy, method="LSODA")),
+    Method("scipy RK45", functools.partial(run_scipy, method="RK45"), Style("#555555", "dotted")),
+    Method(
+        "scipy DOP853", functools.partial(run_scipy, method="DOP853"), Style("#888888", "dotted")
+    ),
+    Method("scipy LSODA", functools.partial(run_scipy, method="LSODA"), Style("#BBBBBB", "dotted")),
 )
 
 

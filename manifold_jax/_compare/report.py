@@ -19,13 +19,12 @@ from rich.table import Table
 
 from .. import __version__
 from ..problems import Problem
+from .approaches import APPROACHES
 from .methods import Measurement, Method
 from .task import OUTPUT_POINTS, Task
 
 
 # The methods for which the gain is.
-STABILIZATIONS = ("invariant", "exact", "baumgarte")
-NEEDS_SYSTEM = "needs a mechanical system"
 
 
 def sizes(problem: Problem) -> tuple[int, int]:
@@ -121,14 +120,15 @@ def comparison_notes(
         "Run: median, output included. SciPy calls the compiled field from Python and does not "
         "report rejected steps.",
     ]
-    stabilized = [m.key for m in measurements if m.key in STABILIZATIONS]
+    with_gain = {approach.name for approach in APPROACHES if approach.uses_gain}
+    stabilized = [m.key for m in measurements if m.key in with_gain]
     if stabilized:
         notes.append(
             f"Stabilization ({', '.join(stabilized)}) with gain {task.gain:.3g} per unit of time; "
             "its states are handed out uncorrected."
         )
     for method in left_out:
-        notes.append(f"Left out: {method.key}, which {NEEDS_SYSTEM}.")
+        notes.append(f"Left out: {method.key}, which {method.needs}.")
     limit = max_steps(measurements)
     return notes if limit is None else [*notes, f"Step limit chosen for Diffrax: {limit}."]
 
@@ -164,7 +164,7 @@ def write_json(
             "scipy": scipy.__version__,
         },
         "failures": {m.row.method: m.failure for m in measurements if m.failure is not None},
-        "left_out": {method.name(task): NEEDS_SYSTEM for method in left_out},
+        "left_out": {method.name(task): str(method.needs) for method in left_out},
     }
     rows = [vars(measurement.row) for measurement in measurements]
     content = {"problem": task.problem.name, "settings": settings, "rows": rows}

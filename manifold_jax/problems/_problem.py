@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 
+from .._chart import AbstractChart
 from .._constraint import AbstractConstraint
 from .._custom_types import Args, Y
 from .._mechanics import MechanicalSystem
@@ -28,6 +29,7 @@ class Problem(eqx.Module):
     - `terms`: the vector field, a `diffrax.ODETerm`.
     - `constraint`: the manifold.
     - `system`: the [`MechanicalSystem`][] both belong to, or `None` if it is none.
+    - `chart`: coordinates made for this manifold, for [`LocalCoordinates`][], or `None`.
     - `y0`: the initial state at `t0`, on the manifold.
     - `t0`, `t1`: the time span.
     - `args`: named tuple of the physical parameters, or `None` if there are none. Pass
@@ -39,6 +41,7 @@ class Problem(eqx.Module):
     terms: diffrax.AbstractTerm
     constraint: AbstractConstraint
     system: MechanicalSystem | None
+    chart: AbstractChart | None
     y0: Y
     t0: float
     t1: float
@@ -55,6 +58,7 @@ class Problem(eqx.Module):
         terms: diffrax.AbstractTerm | None = None,
         *,
         system: MechanicalSystem | None = None,
+        chart: AbstractChart | None = None,
         t0: float = 0.0,
         t1: float,
         args: Args = None,
@@ -67,7 +71,7 @@ class Problem(eqx.Module):
     ):
         """**Arguments:**
 
-        - `name`, `terms`, `system`, `t0`, `t1`, `args`, `start`: as above. A `system`
+        - `name`, `terms`, `system`, `chart`, `t0`, `t1`, `args`, `start`: as above. A `system`
             provides its constraint and, unless they are given, too, its `terms`.
         - `y0`: the initial state, by default `initial_state(args, start)`.
         - `initial_state`: `(args, start) -> y0`, where `start` is `None` for the
@@ -83,6 +87,7 @@ class Problem(eqx.Module):
         assert (system is None) == (make_constraint is not None)
         self.name = name
         self.system = system
+        self.chart = chart
         self.terms = system.terms if terms is None else terms
         self.t0 = t0
         self.t1 = t1
@@ -161,6 +166,7 @@ class Problem(eqx.Module):
             self.name,
             self.terms,
             system=self.system,
+            chart=self.chart,
             t0=self.t0,
             t1=self.t1,
             args=args,

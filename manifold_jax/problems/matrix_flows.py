@@ -13,6 +13,7 @@ from jaxtyping import Array, Float
 
 from .._constraint import Constraint
 from .._custom_types import FloatScalar, RealScalarLike
+from .._lie_groups import LieGroupChart, SO3
 from ._problem import as_floating, Problem
 
 
@@ -166,6 +167,7 @@ def rotation(*, omega: Any = (1.0, -2.0, 0.5), t1: float = 10.0) -> Problem:
     return Problem(
         "rotation",
         diffrax.ODETerm(_rotation_field),
+        chart=LieGroupChart(SO3()),
         t1=t1,
         args=RotationArgs(as_floating(omega)),
         initial_state=_rotation_initial_state,
