@@ -395,7 +395,10 @@ def test_an_approach_for_some_problems(tmp_path):
         (("pendulum", "--atol", "nan"), "must be a positive number, got nan"),
         (("pendulum", "--gain", "0"), "must be a positive number, got 0.0"),
         (("pendulum", "--methods", "plain,rattle"), "there is no method 'rattle'. Choose one of"),
-        (("pendulum", "--methods", ""), "partition, lie-group, scipy-rk45, scipy-dop853, scipy-lsoda"),
+        (
+            ("pendulum", "--methods", ""),
+            "partition, lie-group, scipy-rk45, scipy-dop853, scipy-lsoda",
+        ),
         (("kepler", "--methods", "baumgarte"), "mechanical system, which `kepler` has not"),
         (("pendulum", "--t1", "0"), "must be later than the start of `pendulum`, t0 = 0"),
         (("arevalo", "--t1", "0.5"), "t0 = 1; got 0.5"),

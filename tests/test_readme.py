@@ -14,7 +14,7 @@ README = Path(__file__).parents[1] / "README.md"
 BLOCKS = re.findall(r"```python\n(.*?)```", README.read_text(), flags=re.DOTALL)
 # What the others need of the first one, as the text says: the imports and the setting.
 PREAMBLE = BLOCKS[0].split("\n\n\n")[0]
-NAMES = ["fifteen lines", "mechanism", "curves and minima", "fit"]
+NAMES = ["fifteen lines", "mechanism", "curves and minima", "fit", "extend"]
 
 
 def run(*blocks):
@@ -51,7 +51,17 @@ def check_fit(namespace):
     assert abs(fit.parameters["length"] - 1) < 3 * fit.standard_errors["length"] < 0.002
 
 
-CHECKS = (check_fifteen_lines, check_mechanism, check_curves_and_minima, check_fit)
+def check_extend(namespace):
+    """It asserts by itself what the text says; by Newton's method the same."""
+    cylinder = namespace["Cylinder"]()
+    newton = namespace["mj"].Constraint(cylinder)
+    points = [
+        namespace["mj"].project(c, 0.0, np.array([3.0, 4.0, 1.0]))[0] for c in (cylinder, newton)
+    ]
+    np.testing.assert_allclose(points, [[0.6, 0.8, 1.0]] * 2, atol=1e-15)
+
+
+CHECKS = (check_fifteen_lines, check_mechanism, check_curves_and_minima, check_fit, check_extend)
 
 
 @pytest.mark.parametrize("i", range(len(BLOCKS)), ids=NAMES)
