@@ -53,8 +53,10 @@ class SavedValues(eqx.Module):
         for k, saving in enumerate(self._savings):
             if saving.end:
                 unsaved = saving.steps == 0 or self.ends.num_accepted % saving.steps != 0
+                # Without any step (`t0 == t1`) it comes after the copies of the start for `ts`.
+                copies = jnp.where(self.ends.num_steps == 0, saving.num_times, 0)
                 row = jnp.arange(len(self.rows[k].times))
-                used = (row == self.rows[k].count) & unsaved
+                used = (row == self.rows[k].count + copies) & unsaved
                 gradient = self._through_copies(gradient, k, used, self.ends.last, self.ends.y)
         return gradient
 
