@@ -1,13 +1,14 @@
 """Generalized forces of a Lagrangian."""
 
 from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.flatten_util as jfu
 import jax.numpy as jnp
 
-from .._custom_types import Args, RealScalarLike, Y
+from .._custom_types import RealScalarLike, Y
 
 
 class LagrangianForce(eqx.Module):
@@ -16,7 +17,9 @@ class LagrangianForce(eqx.Module):
     lagrangian: Callable
     applied: Callable | None
 
-    def __call__(self, t: RealScalarLike, q: Y, v: Y, args: Args) -> Y:
+    def __call__(self, t: RealScalarLike, q: Y, v: Y, *rest: Any) -> Y:
+        """`rest` are further states, if there are any, and the args."""
+        args = rest[-1]
         x, unravel = jfu.ravel_pytree(q)
         w, _ = jfu.ravel_pytree(v)
         t = jnp.asarray(t, x.dtype)
@@ -26,4 +29,4 @@ class LagrangianForce(eqx.Module):
         force = unravel(jax.grad(L, argnums=1)(t, x, w) - momentum_rate)
         if self.applied is None:
             return force
-        return jax.tree_util.tree_map(jnp.add, force, self.applied(t, q, v, args))
+        return jax.tree_util.tree_map(jnp.add, force, self.applied(t, q, v, *rest))

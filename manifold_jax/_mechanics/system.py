@@ -6,18 +6,18 @@ from typing import Any
 import diffrax as dfx
 import equinox as eqx
 import jax
-import jax.flatten_util as jfu
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from .._constraint import AbstractConstraint
 from .._custom_types import Args, RealScalarLike, Y
 from .._directed_term import DirectedTerm
-from .._linear import combine, factorize, gram, gram_written_out, multiply
 from .._user_function import check_function
 from .constraint import MechanicalConstraint
-from .kinematics import check_mechanical_state, Kinematics
+from .further import check_further_rates, ExtendedConstraint
 from .lagrangian import LagrangianForce
-from .mass import ConfigurationMass, LagrangianMass, Mass
+from .mass import ConfigurationMass, LagrangianMass
+from .motion import Motion
 from .stabilization import Baumgarte, VelocityStabilization
 
 
@@ -52,6 +52,10 @@ class MechanicalSystem(eqx.Module):
         masses, the gyroscopic terms. [`MechanicalSystem.from_lagrangian`][] derives those.
     - `velocity_constraint`: `a(t, q, v, args) = A(t, q) v - b(t, q)`, constraints that are not
         derivatives of positions (nonholonomic): rolling, skating.
+    - `further`: `z' = h(t, q, v, z, args)`, equations of further states `z` (any pytree): actuators,
+        controllers, quadratures. The state is `(q, v, z)` then, and the force
+        `Q(t, q, v, z, args)`; corrections leave `z` as it is.
+    - `further_constraint`: a constraint on `z` alone, such as [`Sphere`][], which corrects it.
     - `stabilization`: [`Baumgarte`][] or [`VelocityStabilization`][]; not needed with
         [`Projected`][] or [`LocalCoordinates`][].
     - `redundant`: constraints may depend on each other (closed loops described twice). The
@@ -72,6 +76,8 @@ class MechanicalSystem(eqx.Module):
     nonholonomic: Callable | None
     mass_matrix: Callable
     force: Callable
+    further: Callable | None
+    further_constraint: AbstractConstraint | None
     stabilization: Baumgarte | VelocityStabilization | None
     redundant: bool = eqx.field(static=True)
 
@@ -82,10 +88,13 @@ class MechanicalSystem(eqx.Module):
         force: Callable,
         *,
         velocity_constraint: Callable | None = None,
+        further: Callable | None = None,
+        further_constraint: AbstractConstraint | None = None,
         stabilization: Baumgarte | VelocityStabilization | None = None,
         redundant: bool = False,
     ):
-        _check_arguments(constraint, force, velocity_constraint, stabilization)
+        _check_arguments(constraint, force, velocity_constraint, stabilization, further)
+        _check_further(further, further_constraint)
         own = isinstance(mass_matrix, LagrangianMass | ConfigurationMass)  # of another system
         if callable(mass_matrix) and not own:
             check_function("mass_matrix", mass_matrix, "M(q, args)")
@@ -93,6 +102,8 @@ class MechanicalSystem(eqx.Module):
         self.holonomic = constraint
         self.nonholonomic = velocity_constraint
         self.force = force
+        self.further = further
+        self.further_constraint = further_constraint
         self.stabilization = stabilization
         self.redundant = redundant
 
@@ -120,15 +131,18 @@ class MechanicalSystem(eqx.Module):
         """
         check_function("lagrangian", lagrangian, "L(t, q, v, args)")
         if force is not None:
-            check_function("force", force, "Q(t, q, v, args)")
+            _check_force(force, kwargs.get("further"))
         mass = LagrangianMass(lagrangian)
         return cls(mass, constraint, LagrangianForce(lagrangian, force), **kwargs)
 
     @property
-    def constraint(self) -> MechanicalConstraint:
+    def constraint(self) -> MechanicalConstraint | ExtendedConstraint:
         """The manifold, for [`Projected`][], [`Stabilized`][] and [`LocalCoordinates`][]."""
-        return MechanicalConstraint(
+        motion = MechanicalConstraint(
             self.holonomic, self.nonholonomic, self.mass_matrix, self.redundant
+        )
+        return (
+            motion if self.further is None else ExtendedConstraint(motion, self.further_constraint)
         )
 
     @property
@@ -140,27 +154,35 @@ class MechanicalSystem(eqx.Module):
 
     def accelerations(self, t: RealScalarLike, y: Y, args: Args = None) -> Y:
         """`a` of `M a + J^T lambda = Q`, like `q`, without stabilization."""
-        motion = _Motion(self, t, y, args)
+        motion = Motion(self, t, y, args)
         return motion.unravel(motion.solve(motion.bias)[0])
 
     def multipliers(self, t: RealScalarLike, y: Y, args: Args = None) -> Float[Array, " m"]:
         """`lambda` of `M a + J^T lambda = Q`: first those of `constraint` in the order of
         `ravel_pytree`, then those of `velocity_constraint`. The constraint force on the
         coordinates is `-J^T lambda`. With `redundant=True` the solution of least norm."""
-        motion = _Motion(self, t, y, args)
+        motion = Motion(self, t, y, args)
         return motion.solve(motion.bias)[1]
 
     def _field(self, t: RealScalarLike, y: Y, args: Args) -> Y:
-        motion = _Motion(self, t, y, args)
+        motion = Motion(self, t, y, args)
         a, _ = motion.solve(motion.bias)
-        if not isinstance(self.stabilization, VelocityStabilization):
-            return y[1], motion.unravel(a)
-        return motion.unravel(motion.stabilized_velocity()), motion.unravel(a)
+        velocity = y[1]
+        if isinstance(self.stabilization, VelocityStabilization):
+            velocity = motion.unravel(motion.stabilized_velocity())
+        return velocity, motion.unravel(a), *self._further_rates(t, y, args)
+
+    def _further_rates(self, t: RealScalarLike, y: Y, args: Args) -> tuple[Y, ...]:
+        if self.further is None:
+            return ()
+        rates = self.further(t, *y, args)
+        check_further_rates(rates, y[2])
+        return (rates,)
 
     def _stabilized_field(self, t: RealScalarLike, y: Y, args: Args) -> tuple[Y, Y]:
         """The field, and the part of it that changes sign with the direction of time."""
         assert isinstance(self.stabilization, Baumgarte)
-        motion = _Motion(self, t, y, args)
+        motion = Motion(self, t, y, args)
         alpha, beta = self.stabilization.alpha, self.stabilization.beta
         rate = motion.equations.velocity(motion.t, motion.w, (motion.x, args))
         p = motion.num_positions
@@ -169,65 +191,15 @@ class MechanicalSystem(eqx.Module):
         )
         a, _ = motion.solve(stiffness)
         damping = motion.constrained(alpha * rate.at[:p].multiply(2))
-        still = jax.tree_util.tree_map(jnp.zeros_like, y[1])
-        return (y[1], motion.unravel(a)), (still, motion.unravel(-damping))
-
-
-class _Motion:
-    """Everything at one state: `C a = -bias`, the mass matrix, and `C M^-1 C^T`, factored."""
-
-    def __init__(self, system: MechanicalSystem, t: RealScalarLike, y: Y, args: Args):
-        q, v = check_mechanical_state(y)
-        self.equations = Kinematics.of(system, y)
-        self.unravel = self.equations.unravel
-        self.x, self.w = self.equations.flat(y)
-        self.t, self.args = jnp.asarray(t, self.x.dtype), args
-        self.C, self.num_positions = self.equations.rows(self.t, self.x, self.w, args)
-        self.bias = self.equations.acceleration_bias(self.t, self.x, self.w, args)
-        self.force = _flat_force(system.force(t, q, v, args), q, self.x)
-        self.mass: Mass = self.equations.mass(self.t, self.x, self.w, args, self.C)
-        self.directions = self.mass.solve(self.C)
-        self.redundant = system.redundant
-        self.factorization = factorize(gram_written_out(self.C, self.directions), system.redundant)
-
-    def solve(self, bias: Float[Array, " m"]) -> tuple[Float[Array, " n"], Float[Array, " m"]]:
-        """Accelerations and multipliers of `M a + C^T lambda = Q`, `C a = -bias`."""
-        force = self.force
-        if self.mass.augmentation is not None:
-            force = force - combine(self.mass.augmentation * bias, self.C)
-        free = self.mass.solve(force)
-        multipliers = self.factorization.solve(multiply(self.C, free) + bias)
-        # Added, not selected: the derivative of a discarded NaN would be NaN.
-        valid = self.mass.valid & self.factorization.full_rank
-        undefined = jnp.where(valid, 0, jnp.nan).astype(free.dtype)
-        return free - combine(multipliers, self.directions) + undefined, multipliers + undefined
-
-    def constrained(self, b: Float[Array, " m"]) -> Float[Array, " n"]:
-        """The smallest change of the velocities, in the metric of the masses, with `C dv = b`."""
-        return combine(self.factorization.solve(b), self.directions)
-
-    def stabilized_velocity(self) -> Float[Array, " n"]:
-        p = self.num_positions
-        rate = self.equations.velocity(self.t, self.w, (self.x, self.args))[:p]
-        J, directions = self.C[:p], self.directions[:p]
-        return self.w - combine(
-            factorize(gram(J, directions), self.redundant).solve(rate), directions
-        )
-
-
-def _flat_force(force: Any, q: Y, x: Float[Array, " n"]) -> Float[Array, " n"]:
-    shapes = lambda tree: jax.tree_util.tree_map(jnp.shape, tree)
-    if shapes(force) != shapes(q):
-        raise ValueError(
-            f"`force` must return Q(t, q, v, args) of the structure and shapes of q, {shapes(q)}, got {shapes(force)}."
-        )
-    return jfu.ravel_pytree(force)[0].astype(x.dtype)
+        still = jax.tree_util.tree_map(jnp.zeros_like, y)
+        field = y[1], motion.unravel(a), *self._further_rates(t, y, args)
+        return field, (still[0], motion.unravel(-damping), *still[2:])
 
 
 def _check_arguments(
-    constraint: Any, force: Any, velocity_constraint: Any, stabilization: Any
+    constraint: Any, force: Any, velocity_constraint: Any, stabilization: Any, further: Any
 ) -> None:
-    check_function("force", force, "Q(t, q, v, args)")
+    _check_force(force, further)
     if constraint is not None:
         check_function("constraint", constraint, "phi(t, q, args)")
     if velocity_constraint is not None:
@@ -241,4 +213,24 @@ def _check_arguments(
         raise TypeError(
             "`stabilization` must be `mj.Baumgarte(alpha, beta)` or `mj.VelocityStabilization()`, got "
             f"{type(stabilization).__name__}. Others are arguments of `mj.Stabilized`."
+        )
+
+
+def _check_force(force: Any, further: Any) -> None:
+    call = "Q(t, q, v, args)" if further is None else "Q(t, q, v, z, args)"
+    check_function("force", force, call)
+
+
+def _check_further(further: Any, further_constraint: Any) -> None:
+    if further is not None:
+        check_function("further", further, "h(t, q, v, z, args)")
+    elif further_constraint is not None:
+        raise ValueError(
+            "`further_constraint` is for the states of `further`, which is None. Constraints on positions and "
+            "velocities are `constraint` and `velocity_constraint`."
+        )
+    if not isinstance(further_constraint, AbstractConstraint | None):
+        raise TypeError(
+            "`further_constraint` must be an `mj.Constraint` on z, or another one, got "
+            f"{type(further_constraint).__name__}. Write e.g. `mj.Constraint(lambda t, z, args: z @ z - 1.0)`."
         )

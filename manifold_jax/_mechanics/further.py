@@ -1,0 +1,99 @@
+"""The manifold of a mechanical system with further states."""
+
+import dataclasses
+from typing import Any
+
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jaxtyping import Array, Float
+
+from .._constraint import AbstractConstraint
+from .._correction import Normals
+from .._custom_types import Args, RealScalarLike, Y
+from .._projection import NewtonProjection
+from .._projection_info import ProjectionInfo
+from .constraint import MechanicalConstraint
+
+
+class ExtendedConstraint(AbstractConstraint):
+    """The constraints of a [`MechanicalSystem`][] on its state `(q, v, z)`: those of the motion
+    `(q, v)`, and of the further states `z` alone, if they have any.
+
+    Built by `MechanicalSystem.constraint`. Both are corrected by themselves. Normals are those of
+    the motion: in local coordinates `z` is corrected along its own.
+    """
+
+    motion: MechanicalConstraint
+    further: AbstractConstraint | None
+
+    @property
+    def redundant(self) -> bool:
+        return self.motion.redundant or (self.further is not None and self.further.redundant)
+
+    def __call__(self, t: RealScalarLike, y: Y, args: Args = None) -> Any:
+        motion, z = split(y)
+        residual = self.motion(t, motion, args)
+        return residual if self.further is None else (*residual, self.further(t, z, args))
+
+    def correct(
+        self, projection, t, y, args=None, *, fallback=None, far=False, directions=None
+    ) -> tuple[Y, ProjectionInfo]:
+        motion, z = split(y)
+        safe, safe_z = split(y if fallback is None else fallback)
+        of_motion, of_further = _projections(projection, y)
+        motion, info = self.motion.correct(
+            of_motion, t, motion, args, fallback=safe, far=far, directions=directions
+        )
+        if self.further is None:
+            return (*motion, z), info
+        z, more = self.further.correct(of_further, t, z, args, fallback=safe_z, far=far)
+        return (*motion, z), ProjectionInfo.of_parts(info, more)
+
+    def normals(self, projection, t, y, args=None) -> Normals:
+        return self.motion.normals(_projections(projection, y)[0], t, split(y)[0], args)
+
+    def push_forward(self, t, y, args, directions: Float[Array, "m k"], vector) -> Y:
+        (motion, z), (e, e_z) = split(y), split(vector)
+        e = self.motion.push_forward(t, motion, args, directions, e)
+        if self.further is not None:
+            normals = self.further.normals(NewtonProjection(), t, z, args)
+            e_z = self.further.push_forward(t, z, args, normals.directions, e_z)
+        return (*e, e_z)
+
+    def faults(self, t, y, args=None):
+        motion, z = split(y)
+        faults = self.motion.faults(t, motion, args)
+        return faults if self.further is None else (*faults, *self.further.faults(t, z, args))
+
+
+def split(y: Y) -> tuple[tuple[Y, Y], Y]:
+    """`(q, v)` and `z`. Refuses, while tracing, states that are not `(q, v, z)`."""
+    if not (isinstance(y, tuple) and len(y) == 3):
+        raise ValueError(
+            "`y` must be the tuple `(q, v, z)` of positions, velocities and the further states of a mechanical "
+            f"system with `further`, got {type(y).__name__}"
+            f"{f' of {len(y)}' if isinstance(y, tuple) else ''}. Write e.g. `y0 = (q0, jnp.zeros_like(q0), z0)`."
+        )
+    q, v, z = y
+    return (q, v), z
+
+
+def check_further_rates(rates: Any, z: Y) -> None:
+    shapes = lambda tree: jtu.tree_map(jnp.shape, tree)
+    if jtu.tree_structure(rates) != jtu.tree_structure(z) or shapes(rates) != shapes(z):
+        raise ValueError(
+            f"`further` must return h(t, q, v, z, args) of the structure and shapes of z, {shapes(z)}, got {shapes(rates)}."
+        )
+
+
+def _projections(projection: NewtonProjection, y: Y) -> tuple[NewtonProjection, NewtonProjection]:
+    """Of the motion and of the further states, each with its part of the metric."""
+    if projection.metric is None or isinstance(projection.metric, str):
+        return projection, projection
+    if jtu.tree_structure(projection.metric) != jtu.tree_structure(y):
+        projection.inverse_metric(y)  # says so
+    motion, z = split(projection.metric)
+    return (
+        dataclasses.replace(projection, metric=motion),
+        dataclasses.replace(projection, metric=z),
+    )

@@ -1,0 +1,67 @@
+"""Everything that the equations of motion need at one state."""
+
+from typing import Any
+
+import jax
+import jax.flatten_util as jfu
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from .._custom_types import Args, RealScalarLike, Y
+from .._linear import combine, factorize, gram, gram_written_out, multiply
+from .further import split
+from .kinematics import check_mechanical_state, Kinematics
+from .mass import Mass
+
+
+class Motion:
+    """Everything at one state: `C a = -bias`, the mass matrix, and `C M^-1 C^T`, factored."""
+
+    def __init__(self, system: Any, t: RealScalarLike, y: Y, args: Args):
+        state = y if system.further is None else split(y)[0]
+        q, v = check_mechanical_state(state)
+        further = () if system.further is None else y[2:]
+        self.equations = Kinematics.of(system, state)
+        self.unravel = self.equations.unravel
+        self.x, self.w = self.equations.flat(state)
+        self.t, self.args = jnp.asarray(t, self.x.dtype), args
+        self.C, self.num_positions = self.equations.rows(self.t, self.x, self.w, args)
+        self.bias = self.equations.acceleration_bias(self.t, self.x, self.w, args)
+        self.force = _flat_force(system.force(t, q, v, *further, args), q, self.x)
+        self.mass: Mass = self.equations.mass(self.t, self.x, self.w, args, self.C)
+        self.directions = self.mass.solve(self.C)
+        self.redundant = system.redundant
+        self.factorization = factorize(gram_written_out(self.C, self.directions), system.redundant)
+
+    def solve(self, bias: Float[Array, " m"]) -> tuple[Float[Array, " n"], Float[Array, " m"]]:
+        """Accelerations and multipliers of `M a + C^T lambda = Q`, `C a = -bias`."""
+        force = self.force
+        if self.mass.augmentation is not None:
+            force = force - combine(self.mass.augmentation * bias, self.C)
+        free = self.mass.solve(force)
+        multipliers = self.factorization.solve(multiply(self.C, free) + bias)
+        # Added, not selected: the derivative of a discarded NaN would be NaN.
+        valid = self.mass.valid & self.factorization.full_rank
+        undefined = jnp.where(valid, 0, jnp.nan).astype(free.dtype)
+        return free - combine(multipliers, self.directions) + undefined, multipliers + undefined
+
+    def constrained(self, b: Float[Array, " m"]) -> Float[Array, " n"]:
+        """The smallest change of the velocities, in the metric of the masses, with `C dv = b`."""
+        return combine(self.factorization.solve(b), self.directions)
+
+    def stabilized_velocity(self) -> Float[Array, " n"]:
+        p = self.num_positions
+        rate = self.equations.velocity(self.t, self.w, (self.x, self.args))[:p]
+        J, directions = self.C[:p], self.directions[:p]
+        return self.w - combine(
+            factorize(gram(J, directions), self.redundant).solve(rate), directions
+        )
+
+
+def _flat_force(force: Any, q: Y, x: Float[Array, " n"]) -> Float[Array, " n"]:
+    shapes = lambda tree: jax.tree_util.tree_map(jnp.shape, tree)
+    if shapes(force) != shapes(q):
+        raise ValueError(
+            f"`force` must return Q(t, q, v, args) of the structure and shapes of q, {shapes(q)}, got {shapes(force)}."
+        )
+    return jfu.ravel_pytree(force)[0].astype(x.dtype)
