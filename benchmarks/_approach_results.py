@@ -75,7 +75,7 @@ class Setting:
     m: int
     gain: float
     compile_s: Mapping[str, float | None]
-    predicted: Mapping[str, Cost]
+    predicted: Mapping[str, Cost | None]
 
 
 def prepare(

@@ -37,16 +37,17 @@ def cost_table(name: str, setting: Setting, rows: Sequence[Row], tolerance: floa
     return table
 
 
-def _cost_cells(row: Row, predicted: Cost) -> list[str]:
+def _cost_cells(row: Row, predicted: Cost | None) -> list[str]:
     per_step = {name: getattr(row, name) / row.attempts for name in ("f", "g", "velocity", "G")}
+    expected = lambda name: "-" if predicted is None else f"{getattr(predicted, name):g}"
     return [
         str(row.accepted),
         str(row.rejected),
-        f"{per_step['f']:.1f} / {predicted.f:g}",
-        f"{per_step['g']:.1f} / {predicted.g:g}",
+        f"{per_step['f']:.1f} / {expected('f')}",
+        f"{per_step['g']:.1f} / {expected('g')}",
         f"{per_step['velocity']:.1f}",
-        f"{per_step['G']:.1f} / {predicted.G:g}",
-        f"{predicted.flops:.0f}",
+        f"{per_step['G']:.1f} / {expected('G')}",
+        "-" if predicted is None else f"{predicted.flops:.0f}",
     ]
 
 

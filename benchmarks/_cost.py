@@ -32,8 +32,9 @@ def stages_per_step(solver: dfx.AbstractSolver) -> int:
     return tableau.num_stages - (1 if tableau.fsal and tableau.ssal else 0)
 
 
-def predicted_cost(approach: str, s: int, n: int, m: int) -> Cost:
-    """`s` stages, `n` numbers in the state, `m` constraints (of mechanics: both halves).
+def predicted_cost(approach: str, s: int, n: int, m: int) -> Cost | None:
+    """`s` stages, `n` numbers in the state, `m` constraints (of mechanics: both halves). None for
+    approaches whose costs depend on the problem (charts of its own) or are not known here.
 
     In charts every lift has a Jacobian of its own, besides that of the chart.
     """
@@ -54,4 +55,4 @@ def predicted_cost(approach: str, s: int, n: int, m: int) -> Cost:
         "tangent": chart,
         "partition": chart,
     }
-    return costs[approach]
+    return costs.get(approach)

@@ -67,7 +67,9 @@ def content(
     problems = {
         name: {
             **dataclasses.asdict(s),
-            "predicted": {method: cost._asdict() for method, cost in s.predicted.items()},
+            "predicted": {
+                method: cost._asdict() for method, cost in s.predicted.items() if cost is not None
+            },
         }
         for name, s in settings.items()
     }

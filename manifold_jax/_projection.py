@@ -86,6 +86,11 @@ class NewtonProjection(eqx.Module):
         """The largest scaled residual that counts as success."""
         return 50 * float(jnp.finfo(dtype).eps) if self.tolerance is None else self.tolerance
 
+    @property
+    def is_euclidean(self) -> bool:
+        """Whether nearest means nearest in the plain norm, for constraints without masses."""
+        return self.metric is None or (isinstance(self.metric, str) and self.metric == "identity")
+
     def inverse_metric(self, y: Y) -> Float[Array, " n"] | None:
         """Diagonal of `W^-1`, in the order of `ravel_pytree(y)`; `None` for the identity, and for
         the masses of a mechanical system unless `metric="identity"`."""

@@ -244,6 +244,43 @@ def test_a_step_of_more_than_half_a_turn_is_rejected():
     assert run(dfx.ConstantStepSize()).result != dfx.RESULTS.successful
 
 
+class Motions2(mj.AbstractLieGroup):
+    """Of somebody else: motions of the plane as `(angle, x, y)`, moved by the angle first."""
+
+    dimension = 3
+
+    def tangent(self, y, velocity):
+        c, s = jnp.cos(y[0]), jnp.sin(y[0])
+        u = velocity[1:]
+        return jnp.stack([velocity[0], c * u[0] - s * u[1], s * u[0] + c * u[1]])
+
+    def velocity(self, y, tangent):
+        return self.tangent(-y, tangent)
+
+    def moved(self, y, w, cayley):
+        c, s = jnp.cos(y[0]), jnp.sin(y[0])
+        return y + jnp.stack([w[0], c * w[1] - s * w[2], s * w[1] + c * w[2]])
+
+    def rate(self, w, velocity, cayley):
+        c, s = jnp.cos(w[0]), jnp.sin(w[0])
+        u = velocity[1:]
+        return jnp.stack([velocity[0], c * u[0] - s * u[1], s * u[0] + c * u[1]])
+
+    def is_within(self, w, cayley):
+        return jnp.isfinite(w).all() & (jnp.abs(w[0]) < 2.0)
+
+
+def test_a_group_of_somebody_else():
+    """It may move as far as it says, whatever its components mean."""
+    group = Motions2()
+    field = dfx.ODETerm(lambda t, y, args: group.tangent(y, jnp.array([0.1, 100.0, 0.0])))
+    constraint = mj.Constraint(lambda t, y, args: y[0] - 0.1 * t)  # of what is known anyway
+    hook = mj.LocalCoordinates(dfx.Tsit5(), constraint, chart=mj.LieGroupChart(group))
+    sol = mj.diffeqsolve(field, hook, 0.0, 1.0, 1.0, jnp.zeros(3))
+    expected = [0.1, 1000 * np.sin(0.1), 1000 * (1 - np.cos(0.1))]
+    np.testing.assert_allclose(sol.ys[0], expected, rtol=1e-9)
+
+
 @pytest.mark.usefixtures("as_a_user_meets_it")
 def test_bad_arguments():
     with pytest.raises(ValueError, match="`coordinates`.*'exponential' or 'cayley'"):

@@ -200,6 +200,20 @@ def test_other_approaches_and_metrics(hook):
     np.testing.assert_allclose(sol.ys[0] @ sol.ys[0], 1, rtol=0, atol=1e-15)
 
 
+@pytest.mark.parametrize("name", ["sphere", "stiefel"])
+def test_weights(name):
+    """Given as an array of NumPy, too: the same as for the residual alone."""
+    constraint, y = CASES[name]
+    y, _ = mj.project(constraint, 0.0, y)
+    weights = np.random.default_rng(3).uniform(1.0, 3.0, y.shape)
+    projection = mj.NewtonProjection(metric=weights)
+    correct = lambda c: c.correct(projection, 0.0, 1.01 * y)[0]
+    plain = mj.Constraint(lambda t, y, args: constraint(t, y, args))
+    np.testing.assert_allclose(correct(constraint), correct(plain), rtol=0, atol=1e-14)
+    nearest, _ = constraint.correct(NEWTON, 0.0, 1.01 * y)
+    assert np.abs(correct(constraint) - nearest).max() > 1e-4
+
+
 class Cylinder(mj.AbstractConstraint):
     """Of somebody else: `y_0^2 + y_1^2 = 1`, corrected by a division."""
 

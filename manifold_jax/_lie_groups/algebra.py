@@ -16,7 +16,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 
 Vector = Float[Array, "3"]
@@ -82,6 +82,12 @@ def rotation_rate(w: Vector, velocity: Vector, cayley: bool) -> Vector:
     if cayley:
         return velocity + once / 2 + w * (jnp.sum(w * velocity) / 4)
     return velocity + once / 2 + cotangent_defect(jnp.sum(w * w)) * cross(w, once)
+
+
+def is_within_half_a_turn(w: Vector, cayley: bool) -> Bool[Array, ""]:
+    """By Cayley's map every `w` is, as it turns by `2 arctan(|w| / 2)`."""
+    square = jnp.sum(w * w)
+    return jnp.isfinite(square) if cayley else square < jnp.pi**2
 
 
 def cosine(x: Scalar) -> Scalar:

@@ -6,7 +6,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jaxtyping import Array, Float
 
 import manifold_jax as mj
 
@@ -39,8 +38,8 @@ class LieGroupChart(mj.AbstractChart):
     - `groups`: like the state, or like the upper part of its tree: [`SO3`][], [`SE3`][],
         [`UnitQuaternion`][] or another [`AbstractLieGroup`][] for each part, `None` for
         ordinary components.
-    - `coordinates`: `"exponential"`, or `"cayley"`, which needs no sines. Steps that turn by more
-        than half a turn are rejected.
+    - `coordinates`: `"exponential"`, with which steps of more than half a turn are rejected, or
+        `"cayley"`, which needs no sines and cannot reach half a turn.
 
     Prefer [`Projected`][], which is cheaper and about as accurate, unless the field is defined on
     the group only or turns fast: uniform rotations are exact in these coordinates.
@@ -111,10 +110,9 @@ class _LieCoordinates(mj.AbstractCoordinates):
     origin: list[Any]
 
     def lift(self, t, w, args) -> tuple[Any, mj.ProjectionInfo]:
-        within = [jnp.asarray(True)]
-        for (group, _), part in zip(self.chart.parts(self.centre), w, strict=True):
-            if group is not None:
-                within.append(_within_half_a_turn(part))
+        parts = zip(self.chart.parts(self.centre), w, strict=True)
+        cayley = self.chart.coordinates == "cayley"
+        within = [group.is_within(w, cayley) for (group, _), w in parts if group is not None]
         within = jnp.all(jnp.stack(within))
         # Replaced before anything is computed with it: the derivative of a NaN is never zero.
         where = lambda a, b: jnp.where(within, a, jax.lax.stop_gradient(b))
@@ -127,11 +125,6 @@ class _LieCoordinates(mj.AbstractCoordinates):
 
     def push_forward(self, t, w, y, args, error) -> Any:
         return jax.jvp(lambda w: self.chart.moved(self.centre, w), (w,), (error,))[1]
-
-
-def _within_half_a_turn(w: Float[Array, " d"]) -> Array:
-    """Also false for what is not finite. The first three components are the rotation."""
-    return jnp.all(jnp.isfinite(w)) & (jnp.sum(w[:3] ** 2) < jnp.pi**2)
 
 
 def _is_group(x: Any) -> bool:

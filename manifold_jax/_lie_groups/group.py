@@ -4,7 +4,7 @@ import abc
 from typing import Any
 
 import equinox as eqx
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 
 class AbstractLieGroup(eqx.Module):
@@ -36,6 +36,11 @@ class AbstractLieGroup(eqx.Module):
     ) -> Float[Array, " d"]:
         r"""$w'$ where $y_0 \phi(w)$ has the velocity $\xi$: the inverse of the derivative of
         $\phi$ applied to it."""
+
+    @abc.abstractmethod
+    def is_within(self, w: Float[Array, " d"], cayley: bool) -> Bool[Array, ""]:
+        r"""Whether $\phi$ is a chart at `w`, well inside; a step that leads out of it is rejected.
+        False for what is not finite."""
 
 
 def check_shape(y: Any, shape: tuple[int, ...], group: str) -> None:

@@ -11,6 +11,7 @@ from .algebra import (
     cotangent_defect,
     cross,
     hat,
+    is_within_half_a_turn,
     Rotation,
     rotation_rate,
     sine_defect,
@@ -65,6 +66,9 @@ class SE3(AbstractLieGroup):
         translation = u - cross(omega, v) / 2
         translation = translation + cross(a, translation) / 2
         return jnp.concatenate([rotation_rate(a, omega, True), translation])
+
+    def is_within(self, w, cayley):
+        return jnp.all(jnp.isfinite(w)) & is_within_half_a_turn(w[:3], cayley)
 
 
 def _inverse_of_exponential(w: Float[Array, "6"], x: Float[Array, "6"]) -> Float[Array, "6"]:

@@ -5,7 +5,7 @@ from typing import ClassVar
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .algebra import cross, hat, Rotation, rotation_rate, vee
+from .algebra import cross, hat, is_within_half_a_turn, Rotation, rotation_rate, vee
 from .group import AbstractLieGroup, check_shape
 
 
@@ -29,6 +29,9 @@ class SO3(AbstractLieGroup):
     def rate(self, w, velocity, cayley):
         return rotation_rate(w, velocity, cayley)
 
+    def is_within(self, w, cayley):
+        return is_within_half_a_turn(w, cayley)
+
 
 class UnitQuaternion(AbstractLieGroup):
     r"""Unit quaternions, scalar first, shape `(4,)`, $2 q' = q\,\omega$ with the angular velocity
@@ -50,6 +53,9 @@ class UnitQuaternion(AbstractLieGroup):
 
     def rate(self, w, velocity, cayley):
         return rotation_rate(w, velocity, cayley)
+
+    def is_within(self, w, cayley):
+        return is_within_half_a_turn(w, cayley)
 
 
 def quaternion_product(p: Float[Array, "4"], q: Float[Array, "4"]) -> Float[Array, "4"]:

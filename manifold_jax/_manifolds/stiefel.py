@@ -48,7 +48,7 @@ class Stiefel(mj.AbstractConstraint):
     def correct(
         self, projection, t, y, args=None, *, fallback=None, far=False, directions=None
     ) -> tuple[Any, mj.ProjectionInfo]:
-        if directions is not None or projection.metric not in (None, "identity"):
+        if directions is not None or not projection.is_euclidean:
             return super().correct(
                 projection, t, y, args, fallback=fallback, far=far, directions=directions
             )
