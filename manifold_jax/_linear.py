@@ -151,26 +151,21 @@ class PseudoInverse(eqx.Module):
         return self.inverse @ b
 
 
-def factorize(
-    A: Float[Array, "m m"], redundant: bool = False, threshold: float | None = None
-) -> Factorization | PseudoInverse:
+def factorize(A: Float[Array, "m m"], redundant: bool = False) -> Factorization | PseudoInverse:
     """Factor `A`, symmetric positive semidefinite if `redundant`.
 
-    The rank counts as full when every pivot exceeds `threshold` times its diagonal entry, by
-    default `10 m eps`:
-    for a Gram matrix `A = G W^-1 G^T` that ratio is the squared sine of the angle between
+    The rank counts as full when every pivot exceeds `10 m eps` times its diagonal entry: for a Gram matrix `A = G W^-1 G^T` that ratio is the squared sine of the angle between
     one row of `G` and the span of those before it, and rounding leaves about `eps` of it.
     """
     if redundant:
         return pseudo_invert(A)
-    threshold = _threshold(A) if threshold is None else threshold
     m, fixed = A.shape[0], jax.lax.stop_gradient(A)
     if m > UNROLL_LIMIT:
-        return _factorize_with_library(A, threshold)
+        return _factorize_with_library(A)
     lu = [[fixed[i, j] for j in range(m)] for i in range(m)]
     full_rank = jnp.asarray(True)
     for k in range(m):
-        accepted = lu[k][k] > threshold * jnp.abs(fixed[k, k])
+        accepted = lu[k][k] > _threshold(A) * jnp.abs(fixed[k, k])
         full_rank &= accepted
         lu[k][k] = jnp.where(accepted, lu[k][k], 1)
         for i in range(k + 1, m):
@@ -202,10 +197,10 @@ def pseudo_invert(
     return PseudoInverse(inverse, finite)
 
 
-def _factorize_with_library(A: Float[Array, "m m"], threshold: float) -> Factorization:
+def _factorize_with_library(A: Float[Array, "m m"]) -> Factorization:
     size = jnp.sqrt(jnp.maximum(jnp.abs(jnp.diagonal(A)), jnp.finfo(A.dtype).tiny))
     equilibrated, _ = jsl.lu_factor(jax.lax.stop_gradient(A / size[:, None] / size[None, :]))
-    full_rank = jnp.all(jnp.abs(jnp.diagonal(equilibrated)) > threshold)
+    full_rank = jnp.all(jnp.abs(jnp.diagonal(equilibrated)) > _threshold(A))
     A = jnp.where(full_rank, A, jnp.eye(A.shape[0], dtype=A.dtype))
     return Factorization(A, jsl.lu_factor(jax.lax.stop_gradient(A)), full_rank)
 

@@ -68,6 +68,8 @@ class TwoStages(NamedTuple):
         positions = self._positions(x, safe_x, crossing, p, far)
         if far:  # the matrix at the corrected positions: the nearest velocities
             crossing, _ = self._crossing(positions.p, w)
+        # Velocities are found by one iteration unless their equations are the user's.
+        far = far and self.equations.nonholonomic is not None
         velocities = self._velocities(positions.p, w, safe_w, crossing, far)
         corrected = tuple(
             equations.unravel(jnp.where(finite, root.p, jnp.nan))

@@ -37,8 +37,8 @@ class Mass(eqx.Module):
     """A factored mass matrix.
 
     - `diagonal`: scalar or `(n,)`; `None` for a full matrix.
-    - `factorization`: of the full matrix, to which `C^T D C` has been added if it is singular.
-    - `augmentation`: the diagonal of `D`, shape `(m,)`, or `None` if it cannot be needed.
+    - `factorization`: of the full matrix, to which `C^T D C` has been added.
+    - `augmentation`: the diagonal of `D`, shape `(m,)`, or `None` for a diagonal.
     - `symmetric`, `positive`: whether the matrix can be used.
     """
 
@@ -86,7 +86,8 @@ def factorize_mass(M: Float[Array, "..."], C: Float[Array, "m n"]) -> Mass:
     A singular matrix is allowed if it is positive definite on the null space of `C`, that is
     if the matrix `[[M, C^T], [C, 0]]` is regular: then `M + C^T D C` is positive definite for
     every `D > 0` and has the same accelerations (augmented Lagrangian; Benzi, Golub & Liesen,
-    Acta Numerica 14 (2005) 1-137, section 5).
+    Acta Numerica 14 (2005) 1-137, section 5). It is taken for regular ones, too: to look first
+    takes two factorizations in every program.
     """
     yes = jnp.asarray(True)
     if M.ndim < 2:
@@ -94,21 +95,16 @@ def factorize_mass(M: Float[Array, "..."], C: Float[Array, "m n"]) -> Mass:
         return Mass(jnp.where(positive, M, 1), None, None, yes, positive)
     asymmetry = jnp.max(jnp.abs(M - M.T))
     symmetric = asymmetry <= 100 * jnp.finfo(M.dtype).eps * jnp.max(jnp.abs(M))
-    # Generous, as nothing is lost by adding to a matrix that is only nearly singular.
-    plain = _factorize_positive(M, float(jnp.finfo(M.dtype).eps) ** 0.5)
     size = jnp.maximum(jnp.sum(C * C, axis=1), jnp.finfo(M.dtype).tiny)
     weights = jax.lax.stop_gradient(jnp.trace(M) / M.shape[0] / size)
-    augmented = lambda: _factorize_positive(M + gram((C * weights[:, None]).T, C.T))
-    factorization = jax.lax.cond(plain.full_rank, lambda: plain, augmented)
-    augmentation = jnp.where(plain.full_rank, 0, weights)
-    return Mass(None, factorization, augmentation, symmetric, factorization.full_rank)
+    factorization = _factorize_positive(M + gram((C * weights[:, None]).T, C.T))
+    return Mass(None, factorization, weights, symmetric, factorization.full_rank)
 
 
-def _factorize_positive(M: Float[Array, "n n"], threshold: float | None = None) -> Factorization:
-    if threshold is None:
-        threshold = 10 * M.shape[0] * float(jnp.finfo(M.dtype).eps)
+def _factorize_positive(M: Float[Array, "n n"]) -> Factorization:
     if M.shape[0] <= UNROLL_LIMIT:
-        return factorize(M, threshold=threshold)  # which wants positive pivots
+        return factorize(M)  # which wants positive pivots
+    threshold = 10 * M.shape[0] * float(jnp.finfo(M.dtype).eps)
     size = jnp.sqrt(jnp.maximum(jnp.abs(jnp.diagonal(M)), jnp.finfo(M.dtype).tiny))
     lower = jnp.linalg.cholesky(jax.lax.stop_gradient(M / size[:, None] / size[None, :]))
     positive = jnp.all(jnp.diagonal(lower) ** 2 > threshold)  # NaN unless positive definite

@@ -94,7 +94,6 @@ def diffeqsolve(
         adjoint=adjoint,
         max_steps=max_steps,
         progress_meter=progress_meter,
-        solver_state=solver_state,
         controller_state=controller_state,
         made_jump=made_jump,
     )
@@ -102,7 +101,18 @@ def diffeqsolve(
         y0 = raise_if_unstable(y0, terms, solver, dt0)
     if not isinstance(solver, AbstractManifoldSolver):
         return solve_without_hook(
-            terms, solver, t0, t1, dt0, y0, args, saveat, throw, event=event, **options
+            terms,
+            solver,
+            t0,
+            t1,
+            dt0,
+            y0,
+            args,
+            saveat,
+            throw,
+            event=event,
+            solver_state=solver_state,
+            **options,
         )
     bends_interpolant = event is not None  # every interpolated value is corrected otherwise
     solver = solver.within(stepsize_controller, bends_interpolant)
@@ -120,6 +130,7 @@ def diffeqsolve(
         saveat=on_manifold_saving(saveat, solver, event),
         event=events_in_true_time(event, terms, ready.t0, ready.t1, ready.dt0),
         throw=False,
+        solver_state=ready.solver_state if solver_state is None else solver_state,
         **options,
     )
     return finish(sol, solver, saveat, event, ready.y0, args, ready.start, throw)

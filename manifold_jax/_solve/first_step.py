@@ -1,16 +1,24 @@
 """A sensible first step of an adaptive solve."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import diffrax as dfx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
+from jaxtyping import Array
 
-from .._custom_types import Args, FloatScalar, RealScalarLike, Y
+from .._custom_types import Args, BoolScalar, FloatScalar, RealScalarLike, Y
 
 
-def initial_step(
+class FirstStep(NamedTuple):
+    """Its size, signed like `t1 - t0`, and the vector field at the start, as `terms.vf` returns it."""
+
+    size: FloatScalar
+    field: Any
+
+
+def first_step(
     terms: Any,
     solver: dfx.AbstractSolver,
     t0: RealScalarLike,
@@ -18,8 +26,8 @@ def initial_step(
     y0: Y,
     args: Args,
     controller: dfx.PIDController,
-) -> FloatScalar:
-    """First step of an adaptive solve of an ODE, signed like `t1 - t0`.
+) -> FirstStep:
+    """First step of an adaptive solve of an ODE.
 
     Diffrax has such an estimate but never reaches it and starts with 0.01 whatever the
     problem. Two evaluations of the vector field give its size `d1` and its rate of change
@@ -32,27 +40,40 @@ def initial_step(
     t0, t1 = jnp.asarray(t0), jnp.asarray(t1)
     order = solver.error_order(terms)
     direction = jnp.where(t1 < t0, -1.0, 1.0).astype(t0.dtype)
-    scale = jtu.tree_map(lambda y: controller.atol + controller.rtol * jnp.abs(y), y0)
+    start = jax.lax.stop_gradient(y0)
+    scale = jtu.tree_map(lambda y: controller.atol + controller.rtol * jnp.abs(y), start)
 
     def norm(v: Y) -> FloatScalar:
         return jnp.asarray(controller.norm(jtu.tree_map(lambda a, s: a / s, v, scale)), t0.dtype)
 
-    unit = jnp.ones((), t0.dtype)
-    vector_field = lambda t, y: terms.vf_prod(t, y, args, unit)
-    f0 = vector_field(t0, y0)
-    d0, d1 = norm(y0), norm(f0)
-    small = (d0 < 1e-5) | (d1 < 1e-5)
     span = jnp.abs(t1 - t0)
     span = jnp.where(jnp.isfinite(span), span, 1.0)  # solved until an event
-    h0 = jnp.where(small, 1e-6 * span, 0.01 * d0 / jnp.where(small, 1.0, d1))
-    step = direction * h0
-    y1 = jtu.tree_map(lambda y, f: y + (step * f).astype(y.dtype), y0, f0)
-    f1 = vector_field(t0 + step, y1)
-    rate = norm(jtu.tree_map(jnp.subtract, f1, f0)) / h0 / jnp.where(small, 1.0, d1)
+    d0 = norm(start)
+
+    def trial(velocity: Y) -> tuple[BoolScalar, FloatScalar, FloatScalar]:
+        """Whether the velocity is too small to say anything, its size otherwise, a trial step."""
+        d1 = norm(velocity)
+        small = (d0 < 1e-5) | (d1 < 1e-5)
+        d1 = jnp.where(small, 1.0, d1)
+        return small, d1, jnp.where(small, 1e-6 * span, 0.01 * d0 / d1)
+
+    def evaluate(at: tuple[Array, Y], _: None) -> tuple[tuple[Array, Y], tuple[Any, Y]]:
+        t, y = at
+        field = terms.vf(t, y, args)
+        velocity = jax.lax.stop_gradient(terms.prod(field, jnp.ones((), t0.dtype)))
+        step = direction * trial(velocity)[2]
+        y = jtu.tree_map(lambda y, f: y + (step * f).astype(y.dtype), start, velocity)
+        return (t0 + step, y), (field, velocity)
+
+    # In a loop, of which a program has one vector field, not two.
+    _, (fields, velocities) = jax.lax.scan(evaluate, (t0, y0), None, length=2)
+    f0, f1 = (jtu.tree_map(lambda v, i=i: v[i], velocities) for i in (0, 1))
+    small, d1, h0 = trial(f0)
+    rate = norm(jtu.tree_map(jnp.subtract, f1, f0)) / h0 / d1
     power = 1 / (order + 1)
-    h1 = (0.01 / jnp.where(small, 1.0, d1)) ** power * rate ** (-order * power)
+    h1 = (0.01 / d1) ** power * rate ** (-order * power)
     h = jnp.where(small, h0, jnp.minimum(100 * h0, h1))
     # A vector field that is not finite near the start says nothing about the step.
     h = jnp.where(jnp.isfinite(h) & (h > 0), h, 1e-3 * span)
-    h = jnp.minimum(h, span)
-    return jax.lax.stop_gradient(direction * h)
+    h = jax.lax.stop_gradient(direction * jnp.minimum(h, span))
+    return FirstStep(h, jtu.tree_map(lambda f: f[0], fields))

@@ -11,18 +11,23 @@ from jaxtyping import Array
 from .._constraint_checks import check_constraint, check_state
 from .._custom_types import Args, RealScalarLike, Y
 from .._directed_term import DirectedTerm
+from .._solver import Stabilized
+from .._solver.advance import HookState
 from .._solver.base import AbstractManifoldSolver, controller_tolerances
-from .first_step import initial_step
+from .._solver.execution import execution_of, WrittenOut
+from .first_step import first_step, FirstStep
 from .start import Consistent, start_state, StartInfo
 
 
 class Ready(NamedTuple):
-    """What a loop starts from; all times in one type of number."""
+    """What a loop starts from; all times in one type of number. The state of the solver, where it
+    is known without `solver.init`."""
 
     t0: Array
     t1: Array
     dt0: RealScalarLike | None
     y0: Y
+    solver_state: HookState | None
     start: StartInfo
 
 
@@ -45,9 +50,11 @@ def prepare(
     t0, t1 = jnp.asarray(t0, time_dtype), jnp.asarray(t1, time_dtype)
     check_constraint(solver.constraint, t0, y0, args)
     y0, start = start_state(solver.constraint, t0, y0, args, solver.projection, consistent, throw)
-    if dt0 is None:
-        dt0 = _first_step(terms, solver, t0, t1, y0, args, controller)
-    return Ready(t0, t1, dt0, y0, start)
+    solver_state = None
+    if dt0 is None and (first := _first_step(terms, solver, t0, t1, y0, args, controller)):
+        dt0 = first.size
+        solver_state = _solver_state(terms, solver, t0, y0, args, first)
+    return Ready(t0, t1, dt0, y0, solver_state, start)
 
 
 def _time_dtype(t0: Any, t1: Any, dt0: Any, saveat: dfx.SaveAt) -> Any:
@@ -65,8 +72,19 @@ def _as_state(y0: Y, time_dtype: Any) -> Y:
         return jtu.tree_map(lambda leaf: jnp.asarray(leaf, jnp.result_type(leaf, time_dtype)), y0)
 
 
-def _first_step(terms, solver, t0, t1, y0, args, controller) -> Any:
+def _first_step(terms, solver, t0, t1, y0, args, controller) -> FirstStep | None:
     tolerances = controller_tolerances(controller)
     if tolerances is None or not isinstance(terms, dfx.ODETerm | DirectedTerm):
         return None
-    return initial_step(terms, solver, t0, t1, y0, args, tolerances)
+    return first_step(terms, solver, t0, t1, y0, args, tolerances)
+
+
+def _solver_state(
+    terms: Any, solver: AbstractManifoldSolver, t0: Array, y0: Y, args: Args, first: FirstStep
+) -> HookState | None:
+    """What `solver.init` would evaluate the vector field for once more, if it is that of `terms`."""
+    t1 = t0 + first.size
+    execution = execution_of(solver.inner, terms, t0, t1, y0, args)
+    if isinstance(solver, Stabilized) or not isinstance(execution, WrittenOut):
+        return None
+    return HookState.initial(execution.memory_of(first.field), t0, t1, y0)
