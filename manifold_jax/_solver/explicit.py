@@ -6,7 +6,6 @@ is evaluated there, so that the derivative that a first-same-as-last method carr
 belongs to the corrected state at no cost.
 """
 
-import dataclasses
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -86,123 +85,58 @@ def explicit_step(
     at_stage = jax.jit(lambda t, w: frame.terms.vf(t, w, args))
     if frame.terms is terms:
         at_stage = at_corrected
+    fsal = is_first_same_as_last(tableau)
+    rows = list(tableau.a_lower)
     # Not beyond `t1` by rounding, where the field may have jumped.
     times = [jnp.asarray(t1 if c == 1 else t0 + float(c) * (t1 - t0)) for c in tableau.c]
     w0, first = frame.origin, frame.pull_back(t0, frame.origin, y0, terms.prod(f0, control))
-    fsal = is_first_same_as_last(tableau)
-    rows = list(tableau.a_lower)
+    inner_rows = rows[:-1] if fsal else rows
+    increment = lambda t, w: frame.terms.prod(at_stage(t, w), control)
     if in_a_loop is None:
         length = num_equations(jax.make_jaxpr(at_stage)(jnp.asarray(t0), w0).jaxpr)
-        in_a_loop = length * len(rows) > LARGEST_UNROLLED and len(rows) > 1
-    stages = Stages(rows, times, at_stage, lambda f: frame.terms.prod(f, control), w0, first)
-    if in_a_loop and fsal and frame.terms is terms:
-        increments, end = stages.in_a_loop_to_corrected(frame.correct, f0)
-    else:
-        inner = stages.first(len(rows) - fsal)
-        increments = inner.in_a_loop() if in_a_loop else inner.written_out()
-        # The last stage of a first-same-as-last method is taken at the new state itself.
-        w1 = derivative_once(_combine(rows[-1] if fsal else tableau.b_sol, increments, w0), w0)
-        y1, info = frame.correct(w1)
-        end = End(w1, y1, None, info)
-        if fsal:
-            at_end = end.usable(y0)
-            end = end._replace(f=at_corrected(times[-1], at_end))
-            last = frame.pull_back(times[-1], w1, at_end, terms.prod(end.f, control))
-            increments = [*increments, last]
+        in_a_loop = length * (len(inner_rows) + 1) > LARGEST_UNROLLED and bool(inner_rows)
+    evaluate = _stages_in_a_loop if in_a_loop else _stages
+    increments = evaluate(inner_rows, times[: len(inner_rows)], increment, w0, first)
+    # The last stage of a first-same-as-last method is taken at the new state itself.
+    w1 = derivative_once(_combine(rows[-1] if fsal else tableau.b_sol, increments, w0), w0)
+    y1, info = frame.correct(w1)
+    f1 = None
+    if fsal:
+        # A failed step may end in NaN, of which the derivative would be NaN, not zero.
+        safe = lambda a, b: jnp.where(info.success, a, jax.lax.stop_gradient(b))
+        end, at_end = jnp.asarray(t1), jtu.tree_map(safe, y1, y0)
+        f1 = at_corrected(end, at_end)
+        increments.append(frame.pull_back(end, w1, at_end, terms.prod(f1, control)))
     error = _combine(tableau.b_error, increments)
     k = jtu.tree_map(lambda *ks: jnp.stack(ks), *increments)
-    return ExplicitStep(end.y, end.w, error, dict(y0=w0, y1=end.w, k=k), end.f, end.info)
+    return ExplicitStep(y1, w1, error, dict(y0=w0, y1=w1, k=k), f1, info)
 
 
-class End(NamedTuple):
-    """Of a step: the coordinates, the state corrected, the vector field there if it is needed, and
-    how the correction went."""
-
-    w: Y
-    y: Y
-    f: Any
-    info: ProjectionInfo
-
-    def usable(self, y0: Y) -> Y:
-        """A failed step may end in NaN, of which the derivative would be NaN, not zero."""
-        safe = lambda a, b: jnp.where(self.info.success, a, jax.lax.stop_gradient(b))
-        return jtu.tree_map(safe, self.y, y0)
+def _stages(rows: list[Any], times: list[Array], increment: Callable, w0: Y, first: Y) -> list[Y]:
+    increments = [first]
+    for row, t in zip(rows, times, strict=True):
+        increments.append(increment(t, derivative_once(_combine(row, increments, w0), w0)))
+    return increments
 
 
-class Stages(NamedTuple):
-    """The stages after the first one: rows of the tableau, times, the vector field `(t, w)` and
-    what it contributes to a step; where the step begins, and the contribution of the first."""
+def _stages_in_a_loop(
+    rows: list[Any], times: list[Array], increment: Callable, w0: Y, first: Y
+) -> list[Y]:
+    """The same with the vector field compiled once, whatever the number of stages."""
+    count = len(rows) + 1
+    padded = [np.pad(np.asarray(row, np.float64), (0, count - len(row))) for row in rows]
+    buffer = jtu.tree_map(lambda k: jnp.zeros((count, *k.shape), k.dtype).at[0].set(k), first)
 
-    rows: list[Any]
-    times: list[Array]
-    vector_field: Callable
-    increment: Callable
-    w0: Y
-    k0: Y
-
-    def first(self, count: int) -> "Stages":
-        return self._replace(rows=self.rows[:count], times=self.times[:count])
-
-    def written_out(self) -> list[Y]:
-        increments = [self.k0]
-        for row, t in zip(self.rows, self.times, strict=True):
-            w = derivative_once(_combine(row, increments, self.w0), self.w0)
-            increments.append(self.increment(self.vector_field(t, w)))
-        return increments
-
-    def in_a_loop(self) -> list[Y]:
-        """The same with the vector field compiled once, whatever the number of stages."""
-
-        def stage(buffer: Y, xs: Any) -> tuple[Y, None]:
-            i, t, row = xs
-            new = self.increment(self.vector_field(t, self._combined(row, buffer)))
-            return _with_row(buffer, i, new), None
-
-        return self._unstacked(jax.lax.scan(stage, self._buffer(), self._scanned())[0])
-
-    def in_a_loop_to_corrected(self, correct: Callable, f0: Any) -> tuple[list[Y], End]:
-        """The same, with the last stage at the corrected end: one vector field in the program."""
-        correct = jax.jit(correct)
-        count = len(self.rows)
-        y1, info = jtu.tree_map(
-            lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(correct, self.w0)
-        )
-        untouched = dataclasses.replace(info, success=jnp.asarray(True))
-
-        def stage(carry: tuple[Y, End], xs: Any) -> tuple[tuple[Y, End], None]:
-            buffer, _ = carry
-            i, t, row = xs
-            w = self._combined(row, buffer)
-            y, info = jax.lax.cond(i == count, correct, lambda w: (w, untouched), w)
-            end = End(w, y, None, info)
-            f = self.vector_field(t, end.usable(self.w0))
-            return (_with_row(buffer, i, self.increment(f)), end._replace(f=f)), None
-
-        start = self._buffer(), End(self.w0, y1, f0, info)
-        (buffer, end), _ = jax.lax.scan(stage, start, self._scanned())
-        return self._unstacked(buffer), end
-
-    def _buffer(self) -> Y:
-        count = len(self.rows) + 1
-        start = lambda k: jnp.zeros((count, *k.shape), k.dtype).at[0].set(k)
-        return jtu.tree_map(start, self.k0)
-
-    def _scanned(self) -> Any:
-        count = len(self.rows) + 1
-        padded = [np.pad(np.asarray(row, np.float64), (0, count - len(row))) for row in self.rows]
-        return jnp.arange(1, count), jnp.stack(self.times), jnp.asarray(np.stack(padded))
-
-    def _combined(self, row: Array, buffer: Y) -> Y:
+    def stage(buffer: Y, xs: Any) -> tuple[Y, None]:
+        i, t, row = xs
         sum_up = lambda k, w: w + jnp.tensordot(row.astype(k.dtype), k, axes=1)
-        return jtu.tree_map(sum_up, buffer, self.w0)
+        new = increment(t, jtu.tree_map(sum_up, buffer, w0))
+        return jtu.tree_map(lambda k, n: k.at[i].set(n), buffer, new), None
 
-    def _unstacked(self, buffer: Y) -> list[Y]:
-        take = lambda i: jtu.tree_map(lambda k: k[i], buffer)
-        return [take(i) for i in range(len(self.rows) + 1)]
-
-
-def _with_row(buffer: Y, i: Array, new: Y) -> Y:
-    return jtu.tree_map(lambda k, n: k.at[i].set(n), buffer, new)
+    xs = jnp.arange(1, count), jnp.stack(times), jnp.asarray(np.stack(padded))
+    buffer, _ = jax.lax.scan(stage, buffer, xs)
+    take = lambda i: jtu.tree_map(lambda k: k[i], buffer)
+    return [take(i) for i in range(count)]
 
 
 def num_equations(jaxpr: Any) -> int:
