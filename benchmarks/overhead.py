@@ -136,7 +136,9 @@ def saved_points(problem: Problem, *, projected_one_by_one: bool = False) -> dfx
     if not projected_one_by_one:
         return dfx.SaveAt(ts=ts)
     project = mj.NewtonProjection()
-    return dfx.SaveAt(ts=ts, fn=lambda t, y, args: project(problem.constraint, t, y, args)[0])
+    return dfx.SaveAt(
+        ts=ts, fn=lambda t, y, args: problem.constraint.correct(project, t, y, args)[0]
+    )
 
 
 def measure(
