@@ -1,0 +1,99 @@
+"""An array that every lane has one of, as separate numbers or as a whole."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+
+# A constant that is the same in every lane and known while tracing (`np.generic`), a number that is
+# the same in every lane (an array of shape ()), or one for each lane (an array of shape (lanes,)).
+Number = Any
+
+
+class Value:
+    """Of shape `shape` in each lane. `numbers()` is an object array of that shape of [`Number`][]s;
+    `whole(lanes)` an array of shape `(*shape, lanes)`: the lanes are contiguous in memory.
+
+    Whichever is not there is made when it is asked for.
+    """
+
+    def __init__(self, shape: tuple[int, ...], dtype: Any, make: Callable[[], np.ndarray]):
+        self.shape, self.dtype = tuple(shape), dtype
+        self._make, self._numbers, self._whole = make, None, None
+
+    @staticmethod
+    def of_numbers(numbers: np.ndarray, dtype: Any) -> "Value":
+        return Value(numbers.shape, dtype, lambda: numbers)
+
+    @staticmethod
+    def of_constant(x: Any) -> "Value":
+        """The same in every lane: an array, also one that is being traced."""
+        if isinstance(x, jax.core.Tracer | jax.Array) and not _is_known(x):
+            return Value(x.shape, x.dtype, lambda: _split(x, x.shape))
+        x = np.asarray(x)
+        return Value(x.shape, x.dtype, lambda: _known_numbers(x))
+
+    @staticmethod
+    def of_whole(x: jax.Array) -> "Value":
+        """From one array whose last axis is that of the lanes."""
+        value = Value(x.shape[:-1], x.dtype, lambda: _split(x, x.shape[:-1]))
+        value._whole = x
+        return value
+
+    def numbers(self) -> np.ndarray:
+        if self._numbers is None:
+            self._numbers = self._make()
+        return self._numbers
+
+    def whole(self, lanes: int) -> jax.Array:
+        if self._whole is None:
+            numbers = [spread(x, lanes, self.dtype) for x in self.numbers().ravel()]
+            if not numbers:
+                return jnp.zeros((*self.shape, lanes), self.dtype)
+            self._whole = jnp.stack(numbers).reshape(*self.shape, lanes)
+        return self._whole
+
+    def entering(self) -> "Value":
+        """For the body of a loop, in which nothing may be made that is kept outside."""
+        value = Value.of_numbers(self.numbers(), self.dtype)
+        value._whole = self._whole
+        return value
+
+    @property
+    def is_known(self) -> bool:
+        """Whether it is a constant, of which all can be computed while tracing."""
+        return all(isinstance(x, np.generic) for x in self.numbers().flat)
+
+    def known(self) -> np.ndarray:
+        return np.array([x for x in self.numbers().flat], self.dtype).reshape(self.shape)
+
+
+def spread(x: Number, lanes: int, dtype: Any) -> jax.Array:
+    """One for each lane."""
+    if isinstance(x, np.generic):
+        return lax.full((lanes,), x, dtype)
+    return x if jnp.ndim(x) == 1 else lax.broadcast(x, (lanes,))
+
+
+def object_array(items: list[Any], shape: tuple[int, ...]) -> np.ndarray:
+    """Of objects that are arrays themselves, which NumPy would look into."""
+    out = np.empty(len(items), object)
+    for i, item in enumerate(items):
+        out[i] = item
+    return out.reshape(shape)
+
+
+def _split(x: jax.Array, shape: tuple[int, ...]) -> np.ndarray:
+    return object_array([x[index] for index in np.ndindex(*shape)], shape)
+
+
+def _known_numbers(x: np.ndarray) -> np.ndarray:
+    return object_array([x[index] for index in np.ndindex(*x.shape)], x.shape)
+
+
+def _is_known(x: Any) -> bool:
+    return isinstance(x, jax.Array) and not isinstance(x, jax.core.Tracer)
