@@ -6,7 +6,7 @@ Seen in Diffrax 0.7.2 and Equinox 0.13.8; each name has a test that fails when i
 from typing import Any
 
 import jax.tree_util as jtu
-from diffrax import RESULTS
+from diffrax import AbstractTerm, MultiTerm, RESULTS
 from diffrax._heuristics import (
     is_sde as is_sde,  # which terms are driven by Brownian motion
     is_unsafe_sde as is_unsafe_sde,  # by one that cannot be evaluated twice
@@ -45,6 +45,12 @@ def time_direction(terms: PyTree) -> RealScalarLike:
         if isinstance(leaf, WrapTerm):
             return leaf.direction
     return 1
+
+
+def directed(terms: PyTree, direction: RealScalarLike) -> PyTree:
+    """Terms in the time in which Diffrax integrates, `t * direction`."""
+    is_leaf = lambda x: isinstance(x, AbstractTerm) and not isinstance(x, MultiTerm)
+    return jtu.tree_map(lambda term: WrapTerm(term, direction), terms, is_leaf=is_leaf)
 
 
 def nonlinear_failure() -> RESULTS:

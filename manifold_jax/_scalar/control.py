@@ -52,11 +52,19 @@ def cond(evaluate: Evaluate, lanes: Lanes, equation: Any, values: list[Value]) -
     return chosen
 
 
-def scan(evaluate: Evaluate, lanes: Lanes, equation: Any, values: list[Value]) -> list[Value] | None:
-    params = equation.params
-    length, num_consts, num_carry = params["length"], params["num_consts"], params["num_carry"]
+def scan(
+    evaluate: Evaluate, lanes: Lanes, equation: Any, values: list[Value]
+) -> list[Value] | None:
+    params, length = equation.params, equation.params["length"]
     if length > _LONGEST_WRITTEN_OUT:
         return None
+    # What is scanned over has one axis less in the body.
+    body = getattr(params["jaxpr"], "jaxpr", params["jaxpr"])
+    scanned = lambda outer, inner: sum(
+        a.aval.ndim > b.aval.ndim for a, b in zip(outer, inner, strict=True)
+    )
+    num_carry = len(equation.outvars) - scanned(equation.outvars, body.outvars)
+    num_consts = len(values) - num_carry - scanned(equation.invars, body.invars)
     consts, carry = values[:num_consts], values[num_consts : num_consts + num_carry]
     stacked = [x.numbers() for x in values[num_consts + num_carry :]]
     dtypes = [x.dtype for x in values[num_consts + num_carry :]]

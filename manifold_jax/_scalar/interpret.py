@@ -38,9 +38,7 @@ def call_in_lanes(lanes: Lanes, function: Callable, *args: Any) -> Any:
     """`function(*args)` in every lane. Leaves of `args` are [`Value`][]s, those of what is returned,
     too. What the function closes over is the same in every lane."""
     leaves, treedef = jtu.tree_flatten(args)
-    examples = jtu.tree_unflatten(
-        treedef, [jax.ShapeDtypeStruct(v.shape, v.dtype) for v in leaves]
-    )
+    examples = jtu.tree_unflatten(treedef, [jax.ShapeDtypeStruct(v.shape, v.dtype) for v in leaves])
     closed, shape = jax.make_jaxpr(function, return_shape=True)(*examples)
     out = evaluate(lanes, closed, leaves)
     return jtu.tree_unflatten(jtu.tree_structure(shape), out)
@@ -75,7 +73,10 @@ def _evaluated(lanes: Lanes, equation: Any, values: list[Value]) -> list[Value]:
     out = None
     if name in _CONTROL:
         out = _CONTROL[name](evaluate, lanes, equation, values)
-    elif max((v.aval.size for v in (*equation.outvars, *equation.invars)), default=0) <= _LARGEST_ARRAY:
+    elif (
+        max((v.aval.size for v in (*equation.outvars, *equation.invars)), default=0)
+        <= _LARGEST_ARRAY
+    ):
         rule = _rule(name)
         out = None if rule is None else rule(lanes, equation, values)
     return _on_whole_arrays(lanes, equation, values) if out is None else out

@@ -57,9 +57,7 @@ class Lanes:
         return [jnp.asarray(x) for x in numbers]
 
     def _key(self, primitive: Any, params: dict[str, Any], numbers: list[Number]) -> Any:
-        same = [
-            (x.dtype.str, x.tobytes()) if isinstance(x, np.generic) else id(x) for x in numbers
-        ]
+        same = [(x.dtype.str, x.tobytes()) if isinstance(x, np.generic) else id(x) for x in numbers]
         key = primitive.name, tuple(params.items()), tuple(same)
         try:
             hash(key)

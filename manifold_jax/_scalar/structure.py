@@ -103,7 +103,7 @@ def dot_general(lanes: Lanes, equation: Any, values: list[Value]) -> list[Value]
 
     shape = A.shape[0], A.shape[1], B.shape[1]
     out = object_array([entry(*index) for index in np.ndindex(*shape)], shape)
-    return [Value.of_numbers(out.reshape(*batch, *a_free, *b_free), aval.dtype)]
+    return [Value.of_numbers(out.reshape((*batch, *a_free, *b_free)), aval.dtype)]
 
 
 def _arranged(value: Value, batch: Any, summed: Any) -> tuple[np.ndarray, list[int], list[int]]:

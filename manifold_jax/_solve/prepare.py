@@ -45,9 +45,9 @@ def prepare(
     throw: bool,
 ) -> Ready:
     """`controller` chooses the first step if `dt0` is None."""
-    time_dtype = _time_dtype(t0, t1, dt0, saveat)
-    y0 = _as_state(y0, time_dtype)
-    t0, t1 = jnp.asarray(t0, time_dtype), jnp.asarray(t1, time_dtype)
+    dtype = time_dtype(t0, t1, dt0, saveat)
+    y0 = _as_state(y0, dtype)
+    t0, t1 = jnp.asarray(t0, dtype), jnp.asarray(t1, dtype)
     check_constraint(solver.constraint, t0, y0, args)
     y0, start = start_state(solver.constraint, t0, y0, args, solver.projection, consistent, throw)
     solver_state = None
@@ -57,7 +57,7 @@ def prepare(
     return Ready(t0, t1, dt0, y0, solver_state, start)
 
 
-def _time_dtype(t0: Any, t1: Any, dt0: Any, saveat: dfx.SaveAt) -> Any:
+def time_dtype(t0: Any, t1: Any, dt0: Any, saveat: dfx.SaveAt) -> Any:
     """The type in which Diffrax will hold times, and the least precision of the state."""
     subs = jtu.tree_leaves(saveat.subs, is_leaf=lambda x: isinstance(x, dfx.SubSaveAt))
     times = [t for t in (t0, t1, dt0, *(s.ts for s in subs)) if t is not None]
@@ -66,10 +66,10 @@ def _time_dtype(t0: Any, t1: Any, dt0: Any, saveat: dfx.SaveAt) -> Any:
         return dtype if jnp.issubdtype(dtype, jnp.floating) else jnp.result_type(float)
 
 
-def _as_state(y0: Y, time_dtype: Any) -> Y:
+def _as_state(y0: Y, dtype: Any) -> Y:
     check_state(y0, "y0")
     with jax.numpy_dtype_promotion("standard"):
-        return jtu.tree_map(lambda leaf: jnp.asarray(leaf, jnp.result_type(leaf, time_dtype)), y0)
+        return jtu.tree_map(lambda leaf: jnp.asarray(leaf, jnp.result_type(leaf, dtype)), y0)
 
 
 def _first_step(terms, solver, t0, t1, y0, args, controller) -> FirstStep | None:

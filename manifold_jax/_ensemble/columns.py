@@ -1,0 +1,63 @@
+"""Trees of values as lists of columns, one number of each lane or each trajectory."""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+
+from .._scalar import Value
+from .._scalar.value import object_array, spread
+
+
+class Layout(NamedTuple):
+    """How columns make up a tree."""
+
+    treedef: Any
+    shapes: list[tuple[int, ...]]
+    dtypes: list[Any]
+
+    @staticmethod
+    def of(tree: Any) -> "Layout":
+        """Of a tree of [`Value`][]s, or of arrays of one trajectory."""
+        leaves, treedef = jtu.tree_flatten(tree)
+        return Layout(treedef, [x.shape for x in leaves], [x.dtype for x in leaves])
+
+    def values(self, columns: list[jax.Array]) -> Any:
+        out, k = [], 0
+        for shape, dtype in zip(self.shapes, self.dtypes, strict=True):
+            size = int(np.prod(shape))
+            out.append(Value.of_numbers(object_array(columns[k : k + size], shape), dtype))
+            k += size
+        return jtu.tree_unflatten(self.treedef, out)
+
+    def arrays(self, columns: list[jax.Array]) -> Any:
+        """With the trajectories in front."""
+        out, k = [], 0
+        for shape in self.shapes:
+            size = int(np.prod(shape))
+            rows = columns[k].shape[0] if size else 0
+            out.append(jnp.stack(columns[k : k + size], axis=1).reshape(rows, *shape))
+            k += size
+        return jtu.tree_unflatten(self.treedef, out)
+
+
+def columns_of_values(tree: Any, lanes: int) -> list[jax.Array]:
+    leaves = jtu.tree_leaves(tree)
+    return [spread(x, lanes, v.dtype) for v in leaves for x in v.numbers().ravel()]
+
+
+def columns_of_arrays(tree: Any) -> list[jax.Array]:
+    """Of arrays with the trajectories in front."""
+    return [
+        column for leaf in jtu.tree_leaves(tree) for column in leaf.reshape(leaf.shape[0], -1).T
+    ]
+
+
+def taken(columns: list[jax.Array], index: jax.Array) -> list[jax.Array]:
+    return [column[index] for column in columns]
+
+
+def where(chosen: jax.Array, a: list[jax.Array], b: list[jax.Array]) -> list[jax.Array]:
+    return [jax.lax.select(chosen, x, y) for x, y in zip(a, b, strict=True)]

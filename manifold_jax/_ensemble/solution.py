@@ -1,0 +1,37 @@
+"""What an ensemble returns."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import numpy as np
+from diffrax import RESULTS
+from jaxtyping import Array, Float, PyTree
+
+from .._compat import is_okay, messages_of_results, number_of_result
+
+
+class EnsembleSolution(eqx.Module):
+    """Of `N` trajectories, in the order of the initial values.
+
+    - `ts`: the times of what was saved, `(N, T)`; infinite where a trajectory did not get there.
+    - `ys`: the saved values, `(N, T, ...)`.
+    - `stats`: as of [`diffeqsolve`][], each of shape `(N,)`.
+    - `result`: the result codes of all trajectories.
+    """
+
+    ts: Float[Array, "N T"]
+    ys: PyTree[Array]
+    stats: dict[str, Any]
+    result: RESULTS
+
+    @property
+    def failed(self) -> Array:
+        """Which trajectories did not get to their end, shape `(N,)`."""
+        return ~jax.vmap(is_okay)(self.result)
+
+    def failures(self, most: int = 10) -> list[tuple[int, str]]:
+        """Numbers and reasons of the first that failed; not under `jit`."""
+        numbers = np.flatnonzero(np.asarray(self.failed))[:most]
+        codes, messages = np.asarray(number_of_result(self.result)), messages_of_results()
+        return [(int(i), messages[codes[i]]) for i in numbers]

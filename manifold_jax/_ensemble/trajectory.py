@@ -1,0 +1,201 @@
+"""One trajectory as functions of arrays: how it begins, one attempted step, a value inside it.
+
+What `diffrax.diffeqsolve` does in its loop, through the public methods of solvers and controllers, so
+that many of them can be advanced by a loop of another kind.
+"""
+
+from typing import Any, NamedTuple
+
+import diffrax as dfx
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from diffrax import RESULTS
+
+from .._compat import directed, is_okay, nonlinear_failure, update_result
+from .._custom_types import Args, BoolScalar, FloatScalar, IntScalar, RealScalarLike, Y
+from .._solve.prepare import prepare
+from .._solve.start import Consistent
+from .._solver.advance import HookState, StepStatistics
+from .._solver.base import AbstractManifoldSolver
+
+
+class Trajectory(NamedTuple):
+    """Between two steps, with times that increase."""
+
+    tprev: FloatScalar
+    tnext: FloatScalar
+    y: Y
+    solver_state: HookState
+    controller_state: Any
+    result: RESULTS
+    num_steps: IntScalar
+    num_accepted: IntScalar
+
+
+class Given(NamedTuple):
+    """What a trajectory is defined by, besides what all have in common."""
+
+    t0: FloatScalar
+    t1: FloatScalar
+    y0: Y
+    args: Args
+
+    @property
+    def direction(self) -> FloatScalar:
+        return jnp.where(self.t0 < self.t1, 1, -1).astype(self.t0.dtype)
+
+
+class Start(NamedTuple):
+    trajectory: Trajectory
+    correction: FloatScalar
+
+
+class Attempt(NamedTuple):
+    """What a step led to; whether it was kept, where it ended if so, and its interpolation."""
+
+    trajectory: Trajectory
+    kept: BoolScalar
+    start: FloatScalar
+    end: FloatScalar
+    dense_info: Any
+
+
+class Outcome(NamedTuple):
+    """Of a trajectory that has ended."""
+
+    t: FloatScalar
+    y: Y
+    result: RESULTS
+    num_steps: IntScalar
+    num_accepted: IntScalar
+    statistics: StepStatistics
+
+
+class Equations(NamedTuple):
+    """What all trajectories have in common."""
+
+    terms: dfx.AbstractTerm
+    solver: AbstractManifoldSolver
+    controller: dfx.AbstractStepSizeController
+    saveat: dfx.SaveAt
+    dt0: RealScalarLike | None
+    max_steps: int
+    consistent: Consistent
+
+    def begin(self, given: Given) -> Start:
+        solver, (t0, t1, y0, args) = self.solver, given
+        ready = prepare(
+            self.terms,
+            solver,
+            t0,
+            t1,
+            self.dt0,
+            y0,
+            args,
+            self.saveat,
+            self.controller,
+            self.consistent,
+            throw=False,
+        )
+        terms, direction = self._directed(given)
+        t0, t1 = ready.t0 * direction, ready.t1 * direction
+        dt0 = None if ready.dt0 is None else ready.dt0 * direction
+        error_order = solver.error_order(terms)
+        tnext, controller_state = self.controller.wrap(direction).init(
+            terms, t0, t1, ready.y0, dt0, args, solver.func, error_order
+        )
+        tnext = jnp.minimum(tnext, t1)
+        solver_state = ready.solver_state
+        if solver_state is None:
+            solver_state = solver.init(terms, t0, tnext, ready.y0, args)
+        result = RESULTS.where(ready.start.success, RESULTS.successful, nonlinear_failure())
+        zero = jnp.zeros((), jnp.int32)
+        trajectory = Trajectory(
+            t0, tnext, ready.y0, solver_state, controller_state, result, zero, zero
+        )
+        return Start(trajectory, ready.start.correction)
+
+    def goes_on(self, given: Given, trajectory: Trajectory) -> BoolScalar:
+        before = trajectory.tprev < given.t1 * given.direction
+        return before & self._successful(trajectory) & (trajectory.num_steps < self.max_steps)
+
+    def attempt(self, given: Given, trajectory: Trajectory) -> Attempt:
+        terms, direction = self._directed(given)
+        t1, solver = given.t1 * direction, self.solver
+        before, end = trajectory, trajectory.tnext
+        y, error, dense_info, solver_state, solver_result = solver.step(
+            terms, before.tprev, end, before.y, given.args, before.solver_state, False
+        )
+        error = jtu.tree_map(lambda x: jnp.where(jnp.isnan(x), jnp.inf, x), error)
+        kept, tprev, tnext, _, controller_state, result = self.controller.wrap(
+            direction
+        ).adapt_step_size(
+            before.tprev,
+            end,
+            before.y,
+            y,
+            given.args,
+            error,
+            solver.error_order(terms),
+            before.controller_state,
+        )
+        tprev = jnp.minimum(tprev, t1)
+        tnext = _clipped(tprev, tnext, t1, kept)
+        keep = lambda a, b: jnp.where(kept, a, b)
+        result = update_result(RESULTS.where(kept, solver_result, RESULTS.successful), result)
+        after = Trajectory(
+            tprev,
+            tnext,
+            jtu.tree_map(keep, y, before.y),
+            jtu.tree_map(keep, solver_state, before.solver_state),
+            controller_state,
+            update_result(before.result, result),
+            before.num_steps + 1,
+            before.num_accepted + kept,
+        )
+        return Attempt(after, jnp.asarray(kept), before.tprev, end, dense_info)
+
+    def value(
+        self, given: Given, t: FloatScalar, start: FloatScalar, end: FloatScalar, dense_info: Any
+    ) -> tuple[Any, BoolScalar]:
+        """What is saved at `t` inside a step, and whether it is on the manifold."""
+        interpolation = self.solver.interpolation_cls(t0=start, t1=end, **dense_info)
+        t, y = t * given.direction, interpolation.evaluate(t)
+        success = jnp.asarray(True)
+        if self.solver.corrects_output:
+            y, info = self.solver.correct(t, y, given.args)
+            success = info.success
+            y = jtu.tree_map(lambda leaf: jnp.where(success, leaf, jnp.nan), y)
+        return self.saveat.subs.fn(t, y, given.args), success
+
+    def outcome(self, given: Given, trajectory: Trajectory, failed: BoolScalar) -> Outcome:
+        """`failed`: whether a value could not be corrected."""
+        result = trajectory.result
+        unfinished = (trajectory.tprev < given.t1 * given.direction) & self._successful(trajectory)
+        result = RESULTS.where(unfinished, RESULTS.max_steps_reached, result)
+        result = update_result(result, trajectory.solver_state.result)
+        output = RESULTS.where(failed, nonlinear_failure(), RESULTS.successful)
+        t = trajectory.tprev * given.direction
+        return Outcome(
+            t,
+            trajectory.y,
+            update_result(result, output),
+            trajectory.num_steps,
+            trajectory.num_accepted,
+            trajectory.solver_state.statistics,
+        )
+
+    def _successful(self, trajectory: Trajectory) -> BoolScalar:
+        return is_okay(trajectory.result)
+
+    def _directed(self, given: Given) -> tuple[Any, FloatScalar]:
+        return directed(self.terms, given.direction), given.direction
+
+
+def _clipped(
+    tprev: FloatScalar, tnext: FloatScalar, t1: FloatScalar, kept: BoolScalar
+) -> FloatScalar:
+    """Not just short of the end, where a step of a few rounding errors would be left."""
+    floor = t1 - 50 * jnp.finfo(t1.dtype).eps * jnp.abs(t1)
+    end = jnp.where(kept, t1, tprev + 0.5 * (t1 - tprev))
+    return jnp.where(tnext > floor, end, tnext)
