@@ -20,6 +20,10 @@ from ._constraint import (
     Constraint as Constraint,
     Invariants as Invariants,
 )
+from ._ensemble import (
+    EnsembleSolution as EnsembleSolution,
+    solve_ensemble as solve_ensemble,
+)
 from ._fit import fit as fit, FitResult as FitResult
 from ._mechanics import (
     Baumgarte as Baumgarte,

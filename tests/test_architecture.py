@@ -16,7 +16,7 @@ FILES = sorted(PACKAGE.rglob("*.py"))
 # Layers, lowest first; a file may import from its own layer or a lower one.
 LAYERS = [
     {"_custom_types", "_compat", "_errors", "_user_function"},
-    {"_linear", "_residual", "_projection", "_stability", "_directed_term"},
+    {"_linear", "_residual", "_projection", "_stability", "_directed_term", "_scalar"},
     {"_newton"},
     {"_correction"},
     {"_projection_info"},
@@ -29,7 +29,7 @@ LAYERS = [
     {"_adjoint"},
     {"_solve"},
     {"_mechanics"},
-    {"_applications"},
+    {"_applications", "_ensemble"},
     {"_fit"},
     {"_manifolds", "_lie_groups"},
     {"problems"},

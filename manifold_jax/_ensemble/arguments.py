@@ -4,6 +4,7 @@ from typing import Any
 
 import diffrax as dfx
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
@@ -56,6 +57,30 @@ def checked_batch(
     each, common = eqx.filter(full, mask), eqx.filter(full, mask, inverse=True)
     times = [t if np.ndim(t) == 0 else t[0] for t in (t0, t1)]
     return Batch(each, common, time_dtype(*times, dt0, saveat), next(iter(sizes.values())))
+
+
+def checked_times(saveat: dfx.SaveAt, batch: Batch) -> dfx.SaveAt:
+    """Refuse, while running, times of `SaveAt(ts=...)` that some trajectory does not reach."""
+
+    def checked(sub: dfx.SubSaveAt) -> dfx.SubSaveAt:
+        if sub.ts is None:
+            return sub
+        ts = sub.ts.astype(batch.dtype)
+        t0, t1 = jax.vmap(lambda each: batch.complete(each)[:2])(batch.each)
+        direction = jnp.where(t0 < t1, 1, -1).astype(ts.dtype)[:, None]
+        ahead = ts[None] * direction
+        before, behind = t0[:, None] * direction, t1[:, None] * direction
+        outside = jnp.any(ahead < before) | jnp.any(ahead > behind)
+        unsorted = jnp.any(ahead[:, 1:] < ahead[:, :-1])
+        ts = eqx.error_if(ts, unsorted, "`saveat.ts` must be sorted from t0 to t1.")
+        ts = eqx.error_if(
+            ts, outside, "`saveat.ts` must lie between t0 and t1 of all trajectories."
+        )
+        return eqx.tree_at(lambda s: s.ts, sub, ts)
+
+    is_sub = lambda x: isinstance(x, dfx.SubSaveAt)
+    subs = jtu.tree_map(checked, saveat.subs, is_leaf=is_sub)
+    return eqx.tree_at(lambda s: s.subs, saveat, subs, is_leaf=lambda x: x is None)
 
 
 def _leaves(tree: Any) -> list[tuple[Any, Any]]:

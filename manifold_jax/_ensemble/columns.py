@@ -7,8 +7,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 
-from .._scalar import Value
-from .._scalar.value import object_array, spread
+from .._scalar import Lanes, object_array, Value
 
 
 class Layout(NamedTuple):
@@ -43,9 +42,8 @@ class Layout(NamedTuple):
         return jtu.tree_unflatten(self.treedef, out)
 
 
-def columns_of_values(tree: Any, lanes: int) -> list[jax.Array]:
-    leaves = jtu.tree_leaves(tree)
-    return [spread(x, lanes, v.dtype) for v in leaves for x in v.numbers().ravel()]
+def columns_of_values(tree: Any, lanes: Lanes) -> list[jax.Array]:
+    return [column for value in jtu.tree_leaves(tree) for column in value.columns(lanes)]
 
 
 def columns_of_arrays(tree: Any) -> list[jax.Array]:

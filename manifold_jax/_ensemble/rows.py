@@ -22,10 +22,10 @@ def saved_rows(sub: dfx.SubSaveAt, batch: Batch, run: Run) -> tuple[Array, Any]:
     if sub.t0:
         parts.append((t0[:, None], _as_row(at(t0, start))))
     if sub.ts is not None:
-        ts = jnp.broadcast_to(sub.ts.astype(t0.dtype), (batch.size, sub.ts.size))
+        ts = jnp.broadcast_to(sub.ts.astype(t0.dtype)[None], (batch.size, sub.ts.size))
         # Also where the solve is of no length, and makes no step.
         first = ts == t0[:, None]
-        reached = (jnp.arange(sub.ts.size) < run.rows[:, None]) | first
+        reached = (jnp.arange(sub.ts.size)[None] < run.rows[:, None]) | first
         values = jtu.tree_map(
             lambda y, y0: jnp.where(_like(first, y), y0[:, None], y), run.values, at(t0, start)
         )

@@ -8,8 +8,7 @@ import jax.tree_util as jtu
 from jax import lax
 from jaxtyping import Array
 
-from .._scalar import call_in_lanes
-from .._scalar.lanes import Lanes
+from .._scalar import call_in_lanes, Lanes
 from .columns import columns_of_arrays, columns_of_values, Layout, taken, where
 from .trajectory import Equations, Given, Outcome, Start
 
@@ -72,7 +71,7 @@ class Schedule:
             first,
             taken(self.given, first),
             taken(starts, first),
-            jnp.zeros(self.count, jnp.int32),
+            jnp.zeros(self.count, int),
             jnp.zeros(self.count, bool),
         )
         outcome_layout, saved_layout = self._layouts(state_layout)
@@ -85,7 +84,7 @@ class Schedule:
         saved = empty(saved_layout, self.size * num_times) if num_times else []
         totals = Totals(
             empty(outcome_layout, self.size),
-            jnp.zeros(self.size, jnp.int32),
+            jnp.zeros(self.size, int),
             saved,
             jnp.asarray(self.count),
             jnp.asarray(0),
@@ -122,8 +121,8 @@ class Schedule:
             with self.lanes.inside():
                 start = self._call(self.equations.begin, taken(self.given, index))
                 layout = Layout.of(start.trajectory)
-                columns = columns_of_values(start.trajectory, self.count)
-                return columns, columns_of_values(start.correction, self.count)
+                columns = columns_of_values(start.trajectory, self.lanes)
+                return columns, columns_of_values(start.correction, self.lanes)
 
         pieces = -(-self.size // self.count)
         index = jnp.minimum(jnp.arange(pieces * self.count), self.size - 1)
@@ -154,7 +153,7 @@ class Schedule:
         return outcomes, Layout.of(jax.eval_shape(value, given, state))
 
     def _step(self, lane: Lane, saved: list[Array], layout: Layout) -> tuple[Lane, list[Array]]:
-        with self.lanes.inside():
+        with self.lanes.inside(lane.state[0]):
             state = layout.values(lane.state)
 
             def attempt(given: Given, trajectory: Any) -> tuple[Any, Any]:
@@ -162,8 +161,8 @@ class Schedule:
                 return goes_on, self.equations.attempt(given, trajectory)
 
             goes_on, tried = self._call(attempt, lane.given, state)
-            active = _column(goes_on, self.count) & (lane.number < self.size)
-            after = columns_of_values(tried.trajectory, self.count)
+            active = _column(goes_on, self.lanes) & (lane.number < self.size)
+            after = columns_of_values(tried.trajectory, self.lanes)
             if self.ts is not None:
                 lane, saved = self._save(lane, saved, tried, active)
             return lane._replace(state=where(active, after, lane.state)), saved
@@ -171,11 +170,11 @@ class Schedule:
     def _save(
         self, lane: Lane, saved: list[Array], tried: Any, active: Array
     ) -> tuple[Lane, list[Array]]:
-        kept = active & _column(tried.kept, self.count)
-        end, start = _column(tried.end, self.count), _column(tried.start, self.count)
+        kept = active & _column(tried.kept, self.lanes)
+        end, start = _column(tried.end, self.lanes), _column(tried.start, self.lanes)
         info_layout = Layout.of(tried.dense_info)
-        info = columns_of_values(tried.dense_info, self.count)
-        direction = _column(self._call(lambda given: given.direction, lane.given), self.count)
+        info = columns_of_values(tried.dense_info, self.lanes)
+        direction = _column(self._call(lambda given: given.direction, lane.given), self.lanes)
         rows = self.ts.size
 
         def time(row: Array) -> Array:
@@ -197,8 +196,8 @@ class Schedule:
                     wrap([end]),
                     info_layout.values(info),
                 )
-                columns = columns_of_values(value, self.count)
-                failed = failed | (here & ~_column(success, self.count))
+                columns = columns_of_values(value, self.lanes)
+                failed = failed | (here & ~_column(success, self.lanes))
             place = jnp.where(here, lane.number * rows + row, self.size * rows)
             saved = [s.at[place].set(x, mode="drop") for s, x in zip(saved, columns, strict=True)]
             return row + here.astype(row.dtype), failed, saved
@@ -212,7 +211,7 @@ class Schedule:
         self, lane: Lane, totals: Totals, starts: list[Array], layout: Layout
     ) -> tuple[Lane, Totals]:
         state, failed = layout.values(lane.state), Layout.of(jnp.asarray(False))
-        goes_on = _column(self._call(self.equations.goes_on, lane.given, state), self.count)
+        goes_on = _column(self._call(self.equations.goes_on, lane.given, state), self.lanes)
         ended = ~goes_on & (lane.number < self.size)
         outcome = self._call(
             self.equations.outcome, lane.given, state, failed.values([lane.failed])
@@ -220,7 +219,7 @@ class Schedule:
         place = jnp.where(ended, lane.number, self.size)
         outcomes = [
             o.at[place].set(x, mode="drop")
-            for o, x in zip(totals.outcomes, columns_of_values(outcome, self.count), strict=True)
+            for o, x in zip(totals.outcomes, columns_of_values(outcome, self.lanes), strict=True)
         ]
         rows = totals.rows.at[place].set(lane.row, mode="drop")
         number = jnp.where(ended, totals.next + jnp.cumsum(ended) - 1, lane.number)
@@ -238,7 +237,7 @@ class Schedule:
         return lane, Totals(outcomes, rows, totals.saved, totals.next + count, totals.ended + count)
 
 
-def _column(value: Any, lanes: int) -> Array:
+def _column(value: Any, lanes: Lanes) -> Array:
     return columns_of_values(value, lanes)[0]
 
 

@@ -6,7 +6,7 @@ import equinox as eqx
 import jax
 import numpy as np
 from diffrax import RESULTS
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, PyTree
 
 from .._compat import is_okay, messages_of_results, number_of_result
 
@@ -20,7 +20,7 @@ class EnsembleSolution(eqx.Module):
     - `result`: the result codes of all trajectories.
     """
 
-    ts: Float[Array, "N T"]
+    ts: PyTree[Array]
     ys: PyTree[Array]
     stats: dict[str, Any]
     result: RESULTS

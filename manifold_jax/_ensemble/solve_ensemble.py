@@ -10,17 +10,18 @@ import jax.tree_util as jtu
 from jaxtyping import Array
 
 from .._adjoint import StepReplayAdjoint
+from .._compat import messages_of_results, number_of_result, update_result
 from .._custom_types import Args, RealScalarLike, Y
 from .._directed_term import DirectedTerm
 from .._errors import clear_errors
 from .._scalar import NotScalarError
 from .._solve.arguments import check_arguments
 from .._solve.diffeqsolve import diffeqsolve
-from .._solve.outcome import raise_if_failed
+from .._solve.outcome import result_of_saved
 from .._solve.start import Consistent
 from .._solver.base import AbstractManifoldSolver
 from .._solver.explicit import is_unrollable
-from .arguments import Batch, checked_batch
+from .arguments import Batch, checked_batch, checked_times
 from .rows import saved_rows
 from .schedule import Schedule
 from .solution import EnsembleSolution
@@ -87,27 +88,37 @@ def solve_ensemble(
     adjoint = StepReplayAdjoint()
     check_arguments(terms, solver, dt0, saveat, stepsize_controller, adjoint, None, consistent)
     batch = checked_batch(t0, t1, dt0, y0s, args, in_axes, saveat, lanes)
-    options = dict(max_steps=max_steps, consistent=consistent)
-    inputs = (terms, solver, stepsize_controller, saveat, dt0, batch)
-    if _is_for_lanes(terms, solver, stepsize_controller, saveat, dt0, batch):
-        try:
-            solution = _in_lanes(inputs, lanes, tuple(options.items()))
-        except NotScalarError:
-            solution = _mapped(inputs, lanes, tuple(options.items()))
-    else:
-        solution = _mapped(inputs, lanes, tuple(options.items()))
-    if throw:
-        solution = raise_if_failed(solution, jnp.any(solution.failed), [])
-    return solution
+    if not isinstance(max_steps, int) or max_steps < 1:
+        raise ValueError(f"`max_steps` must be a positive integer, got {max_steps!r}.")
+    saveat = checked_times(saveat, batch)
+    common = Common(terms, solver, stepsize_controller, saveat, dt0, max_steps, consistent)
+    solve = _in_lanes if _is_for_lanes(common, batch) else _mapped
+    try:
+        solution = solve((common, batch), lanes)
+    except NotScalarError:
+        solution = _mapped((common, batch), lanes)
+    return _raise_if_any_failed(solution) if throw else solution
 
 
-def _is_for_lanes(terms, solver, controller, saveat, dt0, batch: Batch) -> bool:
-    one = batch.one()
+class Common(eqx.Module):
+    """The arguments that all trajectories have in common."""
+
+    terms: Any
+    solver: dfx.AbstractSolver
+    controller: dfx.AbstractStepSizeController
+    saveat: dfx.SaveAt
+    dt0: RealScalarLike | None
+    max_steps: int = eqx.field(static=True)
+    consistent: Consistent = eqx.field(static=True)
+
+
+def _is_for_lanes(common: Common, batch: Batch) -> bool:
+    one, saveat, solver = batch.one(), common.saveat, common.solver
     return (
         isinstance(solver, AbstractManifoldSolver)
-        and isinstance(terms, dfx.ODETerm | DirectedTerm)
-        and is_unrollable(solver.inner, terms, one.t0, one.t1, one.y0, one.args)
-        and type(controller) in (dfx.PIDController, dfx.ConstantStepSize)
+        and isinstance(common.terms, dfx.ODETerm | DirectedTerm)
+        and is_unrollable(solver.inner, common.terms, one.t0, one.t1, one.y0, one.args)
+        and type(common.controller) in (dfx.PIDController, dfx.ConstantStepSize)
         and isinstance(saveat.subs, dfx.SubSaveAt)
         and not (saveat.dense or saveat.subs.steps or saveat.solver_state)
         and not (saveat.controller_state or saveat.made_jump)
@@ -115,69 +126,88 @@ def _is_for_lanes(terms, solver, controller, saveat, dt0, batch: Batch) -> bool:
 
 
 @eqx.filter_custom_vjp
-def _in_lanes(inputs: Any, lanes: int, options: Any) -> EnsembleSolution:
-    terms, solver, controller, saveat, dt0, batch = inputs
-    solver = solver.within(controller, bends_interpolant=False)
-    equations = Equations(terms, solver, controller, saveat, dt0, **dict(options))
-    schedule = Schedule(equations, batch.each, batch.complete, lanes, _LONGEST)
-    run = schedule.run()
+def _in_lanes(inputs: tuple[Common, Batch], lanes: int) -> EnsembleSolution:
+    common, batch = inputs
+    solver = common.solver.within(common.controller, bends_interpolant=False)
+    equations = Equations(
+        common.terms,
+        solver,
+        common.controller,
+        common.saveat,
+        common.dt0,
+        common.max_steps,
+        common.consistent,
+    )
+    run = Schedule(equations, batch.each, batch.complete, lanes, _LONGEST).run()
     outcome, statistics = run.outcome, run.outcome.statistics
     stats = {
         "num_steps": outcome.num_steps,
         "num_accepted_steps": outcome.num_accepted,
         "num_rejected_steps": outcome.num_steps - outcome.num_accepted,
-        "max_steps": jnp.full(batch.size, equations.max_steps),
         "initial_correction": run.start.correction,
         "num_projection_iterations": statistics.iterations,
         "largest_correction": statistics.largest_correction,
         "correction_share": jax.vmap(lambda s: s.correction_share)(statistics),
     }
-    return EnsembleSolution(*saved_rows(saveat.subs, batch, run), stats, outcome.result)
+    ts, ys = saved_rows(common.saveat.subs, batch, run)
+    result = outcome.result
+    if not solver.corrects_output:
+        finite = jax.vmap(lambda ts, ys: result_of_saved(common.saveat, ts, ys))(ts, ys)
+        result = jax.vmap(update_result)(result, finite)
+    return EnsembleSolution(ts, ys, stats, result)
 
 
 @_in_lanes.def_fwd
-def _in_lanes_fwd(perturbed, inputs, lanes, options):
+def _in_lanes_fwd(perturbed, inputs, lanes):
     del perturbed
-    return _in_lanes(inputs, lanes, options), None
+    return _in_lanes(inputs, lanes), None
 
 
 @_in_lanes.def_bwd
-def _in_lanes_bwd(residuals, cotangents, perturbed, inputs, lanes, options):
+def _in_lanes_bwd(residuals, cotangents, perturbed, inputs, lanes):
+    """Through the same trajectories, each by the way back of `diffeqsolve`."""
     del residuals
     smooth, rest = eqx.partition(inputs, perturbed)
 
-    def values(smooth: Any) -> Any:
-        solution = _mapped(eqx.combine(smooth, rest), lanes, options)
-        return eqx.filter(solution, eqx.is_inexact_array)
+    def saved(smooth: Any) -> Any:
+        solution = _mapped(eqx.combine(smooth, rest), lanes)
+        return eqx.filter((solution.ts, solution.ys), eqx.is_inexact_array)
 
-    out, pullback = jax.vjp(values, smooth)
+    values, pullback = jax.vjp(saved, smooth)
     bar = jtu.tree_map(
         lambda x, b: jnp.zeros_like(x) if b is None else b,
-        out,
-        cotangents,
+        values,
+        (cotangents.ts, cotangents.ys),
     )
     return pullback(bar)[0]
 
 
-def _mapped(inputs: Any, lanes: int, options: Any) -> EnsembleSolution:
-    terms, solver, controller, saveat, dt0, batch = inputs
+def _mapped(inputs: tuple[Common, Batch], lanes: int) -> EnsembleSolution:
+    common, batch = inputs
 
-    def one(of_each: Any) -> EnsembleSolution:
+    def one(of_each: Any) -> tuple[Any, ...]:
         given: Given = batch.complete(of_each)
         sol = diffeqsolve(
-            terms,
-            solver,
+            common.terms,
+            common.solver,
             given.t0,
             given.t1,
-            dt0,
+            common.dt0,
             given.y0,
             given.args,
-            saveat=saveat,
-            stepsize_controller=controller,
+            saveat=common.saveat,
+            stepsize_controller=common.controller,
+            max_steps=common.max_steps,
+            consistent=common.consistent,
             throw=False,
-            **dict(options),
         )
-        stats = {name: jnp.asarray(value) for name, value in sol.stats.items()}
-        return EnsembleSolution(sol.ts, sol.ys, stats, sol.result)
+        stats = {name: x for name, x in sol.stats.items() if name != "max_steps"}
+        return sol.ts, sol.ys, stats, sol.result
 
-    return jax.lax.map(one, batch.each, batch_size=min(lanes, batch.size))
+    return EnsembleSolution(*jax.lax.map(one, batch.each, batch_size=min(lanes, batch.size)))
+
+
+def _raise_if_any_failed(solution: EnsembleSolution) -> EnsembleSolution:
+    failed = solution.failed
+    number = jnp.max(jnp.where(failed, number_of_result(solution.result), 0))
+    return eqx.branched_error_if(solution, jnp.any(failed), number, messages_of_results())

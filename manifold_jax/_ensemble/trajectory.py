@@ -139,6 +139,7 @@ class Equations(NamedTuple):
             solver.error_order(terms),
             before.controller_state,
         )
+        kept = jnp.asarray(kept)
         tprev = jnp.minimum(tprev, t1)
         tnext = _clipped(tprev, tnext, t1, kept)
         keep = lambda a, b: jnp.where(kept, a, b)
@@ -151,9 +152,9 @@ class Equations(NamedTuple):
             controller_state,
             update_result(before.result, result),
             before.num_steps + 1,
-            before.num_accepted + kept,
+            before.num_accepted + jnp.where(kept, 1, 0),
         )
-        return Attempt(after, jnp.asarray(kept), before.tprev, end, dense_info)
+        return Attempt(after, kept, before.tprev, end, dense_info)
 
     def value(
         self, given: Given, t: FloatScalar, start: FloatScalar, end: FloatScalar, dense_info: Any

@@ -30,26 +30,28 @@ def elementwise(lanes: Lanes, equation: Any, values: list[Value]) -> list[Value]
     if "sharding" in equation.params:
         params["sharding"] = None
     out = [
-        apply(lanes, equation.primitive, params, [x[index] for x in operands])
+        apply(lanes, equation.primitive, params, aval.dtype, [x[index] for x in operands])
         for index in np.ndindex(*aval.shape)
     ]
     return [Value.of_numbers(object_array(out, aval.shape), aval.dtype)]
 
 
-def apply(lanes: Lanes, primitive: Any, params: dict[str, Any], numbers: list[Number]) -> Number:
+def apply(
+    lanes: Lanes, primitive: Any, params: dict[str, Any], dtype: Any, numbers: list[Number]
+) -> Number:
     if all(isinstance(x, np.generic) for x in numbers):
         return _of_constants(primitive, params, numbers)
     rule = _SHORTER.get(primitive.name)
     shorter = None if rule is None else rule(lanes, params, *numbers)
-    return lanes.apply(primitive, params, numbers) if shorter is None else shorter
+    return lanes.apply(primitive, params, dtype, *numbers) if shorter is None else shorter
 
 
 def add(lanes: Lanes, a: Number, b: Number) -> Number:
-    return apply(lanes, lax.add_p, {}, [a, b])
+    return apply(lanes, lax.add_p, {}, a.dtype, [a, b])
 
 
 def multiply(lanes: Lanes, a: Number, b: Number) -> Number:
-    return apply(lanes, lax.mul_p, {}, [a, b])
+    return apply(lanes, lax.mul_p, {}, a.dtype, [a, b])
 
 
 def _of_constants(primitive: Any, params: dict[str, Any], numbers: list[np.generic]) -> np.generic:
@@ -71,8 +73,8 @@ _PLAIN = {
 }
 
 
-def _is(x: Number, value: float) -> bool:
-    return isinstance(x, np.generic) and x == value
+def _is(x: Number, value: int) -> bool:
+    return isinstance(x, np.generic) and bool(x == value)
 
 
 def _add(lanes: Lanes, params: Any, a: Number, b: Number) -> Number | None:
@@ -82,7 +84,7 @@ def _add(lanes: Lanes, params: Any, a: Number, b: Number) -> Number | None:
 def _sub(lanes: Lanes, params: Any, a: Number, b: Number) -> Number | None:
     if _is(b, 0):
         return a
-    return lanes.apply(lax.neg_p, {}, [b]) if _is(a, 0) else None
+    return lanes.apply(lax.neg_p, {}, b.dtype, b) if _is(a, 0) else None
 
 
 def _mul(lanes: Lanes, params: Any, a: Number, b: Number) -> Number | None:
@@ -92,7 +94,7 @@ def _mul(lanes: Lanes, params: Any, a: Number, b: Number) -> Number | None:
         if _is(x, 1):
             return y
         if _is(x, -1):
-            return lanes.apply(lax.neg_p, {}, [y])
+            return lanes.apply(lax.neg_p, {}, y.dtype, y)
     return None
 
 
@@ -129,9 +131,9 @@ def _converted(lanes: Lanes, params: Any, x: Number) -> Number | None:
 
 
 def _power(lanes: Lanes, params: Any, x: Number) -> Number | None:
-    return {1: lambda: x, 2: lambda: lanes.apply(lax.mul_p, {}, [x, x])}.get(
-        params["y"], lambda: None
-    )()
+    if params["y"] == 1:
+        return x
+    return lanes.apply(lax.mul_p, {}, x.dtype, x, x) if params["y"] == 2 else None
 
 
 _SHORTER = {

@@ -10,7 +10,7 @@ from jax import lax
 
 from .arithmetic import apply
 from .lanes import Lanes
-from .value import object_array, spread, Value
+from .value import object_array, Value
 
 
 Evaluate = Callable[[Lanes, Any, list[Value]], list[Value]]
@@ -46,7 +46,7 @@ def cond(evaluate: Evaluate, lanes: Lanes, equation: Any, values: list[Value]) -
     for cases in zip(*outs, strict=True):
         value = cases[0]
         for k, case in enumerate(cases[1:], 1):
-            here = apply(lanes, lax.ge_p, {}, [number, number.dtype.type(k)])
+            here = apply(lanes, lax.ge_p, {}, bool, [number, number.dtype.type(k)])
             value = _selected(lanes, here, case, value)
         chosen.append(value)
     return chosen
@@ -91,11 +91,12 @@ def while_loop(evaluate: Evaluate, lanes: Lanes, equation: Any, values: list[Val
     params = equation.params
     m, n = params["cond_nconsts"], params["body_nconsts"]
     cond_consts, body_consts, start = values[:m], values[m : m + n], values[m + n :]
-    for value in (*cond_consts, *body_consts):
-        value.numbers()
-    entering = lambda values: [value.entering() for value in values]
+    cond_consts, body_consts = (
+        [value.entering(lanes) for value in values] for values in (cond_consts, body_consts)
+    )
+    entering = lambda values: [value.entering(lanes) for value in values]
     shapes = [(v.shape, v.dtype) for v in start]
-    flat = [spread(x, lanes.count, v.dtype) for v in start for x in v.numbers().ravel()]
+    flat = [x for v in start for x in v.columns(lanes)]
 
     def unflatten(flat: list[Any]) -> list[Value]:
         out, k = [], 0
@@ -107,23 +108,22 @@ def while_loop(evaluate: Evaluate, lanes: Lanes, equation: Any, values: list[Val
 
     def goes_on(values: list[Value]) -> jax.Array:
         (out,) = evaluate(lanes, params["cond_jaxpr"], [*entering(cond_consts), *values])
-        return spread(out.numbers()[()], lanes.count, bool)
+        return out.columns(lanes)[0]
 
     def body(carry: tuple[jax.Array, list[jax.Array]]) -> tuple[jax.Array, list[jax.Array]]:
         active, flat = carry
         with lanes.inside():
             new = evaluate(lanes, params["body_jaxpr"], [*entering(body_consts), *unflatten(flat)])
-            numbers = [spread(x, lanes.count, v.dtype) for v in new for x in v.numbers().ravel()]
+            numbers = [x for v in new for x in v.columns(lanes)]
             flat = [lax.select(active, a, b) for a, b in zip(numbers, flat, strict=True)]
             return active & goes_on(unflatten(flat)), flat
 
-    with lanes.inside():
-        active = goes_on(start)
+    active = goes_on(unflatten(flat))
     _, flat = lax.while_loop(lambda carry: jnp.any(carry[0]), body, (active, flat))
     return unflatten(flat)
 
 
 def _selected(lanes: Lanes, here: Any, a: Value, b: Value) -> Value:
     pairs = zip(a.numbers().ravel(), b.numbers().ravel(), strict=True)
-    out = [apply(lanes, lax.select_n_p, {}, [here, y, x]) for x, y in pairs]
+    out = [apply(lanes, lax.select_n_p, {}, a.dtype, [here, y, x]) for x, y in pairs]
     return Value.of_numbers(object_array(out, a.shape), a.dtype)

@@ -96,14 +96,12 @@ def _on_whole_arrays(lanes: Lanes, equation: Any, values: list[Value]) -> list[V
     """What there is no rule for: the operation itself, mapped over the lanes."""
     lanes.whole.add(equation.primitive.name)
     lanes.count_operations(1)
-    operands = {
-        v: value.whole(lanes.count)
-        for v, value in zip(equation.invars, values, strict=True)
-        if not isinstance(v, jax_core.Literal)
-    }
-    jaxpr = jax_core.Jaxpr((), list(operands), equation.outvars, [equation], equation.effects)
-    function = jax_core.jaxpr_as_fun(jax_core.ClosedJaxpr(jaxpr, ()))
-    if not operands:
-        return [Value.of_constant(x) for x in function()]
-    out = jax.vmap(function, in_axes=-1, out_axes=-1)(*operands.values())
+
+    def bind(*operands: jax.Array) -> list[jax.Array]:
+        out = equation.primitive.bind(*operands, **equation.params)
+        return list(out) if equation.primitive.multiple_results else [out]
+
+    if not values:
+        return [Value.of_constant(x) for x in bind()]
+    out = jax.vmap(bind, in_axes=-1, out_axes=-1)(*(v.whole(lanes) for v in values))
     return [Value.of_whole(x) for x in out]

@@ -135,6 +135,6 @@ def reduce(lanes: Lanes, equation: Any, values: list[Value]) -> list[Value] | No
     x = np.transpose(x, (*kept, *axes)).reshape(*aval.shape, -1)
     if x.shape[-1] == 0:
         return None
-    combine = lambda a, b: apply(lanes, primitive, {}, [a, b])
+    combine = lambda a, b: apply(lanes, primitive, {}, aval.dtype, [a, b])
     out = [functools.reduce(combine, x[index]) for index in np.ndindex(*aval.shape)]
     return [Value.of_numbers(object_array(out, aval.shape), aval.dtype)]

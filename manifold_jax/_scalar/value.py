@@ -6,17 +6,31 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
+
+
+class Node:
+    """An operation on numbers that is not yet given to XLA: once it is, `array` is its result. How
+    often it is used, and how many operations a copy of it would repeat."""
+
+    __slots__ = ("array", "copied", "dtype", "operands", "params", "primitive", "uses")
+
+    def __init__(self, primitive: Any, params: dict[str, Any], dtype: Any, operands: tuple):
+        self.primitive, self.params, self.dtype = primitive, params, np.dtype(dtype)
+        self.operands, self.array, self.uses, self.copied = operands, None, 0, 0
+        for x in operands:
+            if isinstance(x, Node):
+                x.uses += 1
 
 
 # A constant that is the same in every lane and known while tracing (`np.generic`), a number that is
-# the same in every lane (an array of shape ()), or one for each lane (an array of shape (lanes,)).
+# the same in every lane (an array of shape ()), one for each lane (an array of shape (lanes,)), or
+# one that is still to be computed.
 Number = Any
 
 
 class Value:
     """Of shape `shape` in each lane. `numbers()` is an object array of that shape of [`Number`][]s;
-    `whole(lanes)` an array of shape `(*shape, lanes)`: the lanes are contiguous in memory.
+    `whole(lanes)` an array of shape `(*shape, count)`: the lanes are contiguous in memory.
 
     Whichever is not there is made when it is asked for.
     """
@@ -49,17 +63,22 @@ class Value:
             self._numbers = self._make()
         return self._numbers
 
-    def whole(self, lanes: int) -> jax.Array:
+    def whole(self, lanes: Any) -> jax.Array:
         if self._whole is None:
-            numbers = [spread(x, lanes, self.dtype) for x in self.numbers().ravel()]
-            if not numbers:
-                return jnp.zeros((*self.shape, lanes), self.dtype)
-            self._whole = jnp.stack(numbers).reshape(*self.shape, lanes)
+            columns = self.columns(lanes)
+            if not columns:
+                return jnp.zeros((*self.shape, lanes.count), self.dtype)
+            self._whole = jnp.stack(columns).reshape(*self.shape, lanes.count)
         return self._whole
 
-    def entering(self) -> "Value":
+    def columns(self, lanes: Any) -> list[jax.Array]:
+        """One array of all lanes for each number."""
+        return [lanes.array(x, self.dtype) for x in self.numbers().ravel()]
+
+    def entering(self, lanes: Any) -> "Value":
         """For the body of a loop, in which nothing may be made that is kept outside."""
-        value = Value.of_numbers(self.numbers(), self.dtype)
+        numbers = [lanes.emitted(x) for x in self.numbers().ravel()]
+        value = Value.of_numbers(object_array(numbers, self.shape), self.dtype)
         value._whole = self._whole
         return value
 
@@ -70,13 +89,6 @@ class Value:
 
     def known(self) -> np.ndarray:
         return np.array([x for x in self.numbers().flat], self.dtype).reshape(self.shape)
-
-
-def spread(x: Number, lanes: int, dtype: Any) -> jax.Array:
-    """One for each lane."""
-    if isinstance(x, np.generic):
-        return lax.full((lanes,), x, dtype)
-    return x if jnp.ndim(x) == 1 else lax.broadcast(x, (lanes,))
 
 
 def object_array(items: list[Any], shape: tuple[int, ...]) -> np.ndarray:

@@ -1,0 +1,178 @@
+"""Many trajectories in lanes: each is what it is alone."""
+
+import importlib
+
+import diffrax as dfx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import manifold_jax as mj
+
+
+module = importlib.import_module("manifold_jax._ensemble.solve_ensemble")
+PID = dfx.PIDController(rtol=1e-6, atol=1e-6)
+CIRCLE = mj.Constraint(lambda t, y, args: y @ y - 1)
+TURN = dfx.ODETerm(lambda t, y, args: args * jnp.stack([-y[1], y[0]]) * (1 + y[0] ** 2 * t))
+SIZE, LANES = 7, 3  # lanes are refilled, and one is left over
+ANGLES = np.linspace(0.1, 2.9, SIZE)
+STARTS = jnp.asarray(np.stack([np.cos(ANGLES), np.sin(ANGLES)], 1))
+RATES = jnp.linspace(0.5, 3.0, SIZE)
+HOOKS = {
+    "projected": mj.Projected(dfx.Bosh3(), CIRCLE),
+    "stabilized": mj.Stabilized(dfx.Bosh3(), CIRCLE, stabilization=mj.InvariantStabilization(2.0)),
+    "charts": mj.LocalCoordinates(dfx.Bosh3(), CIRCLE),
+}
+
+
+@pytest.fixture
+def only_in_lanes(monkeypatch):
+    """The way of `diffeqsolve` fails the test."""
+
+    def refuse(*args):
+        raise AssertionError("not in lanes")
+
+    monkeypatch.setattr(module, "_mapped", refuse)
+
+
+def alone(hook, t0, t1, dt0, y0, args, **options):
+    return mj.diffeqsolve(TURN, hook, t0, t1, dt0, y0, args, throw=False, **options)
+
+
+def assert_equal(sol, singles, atol=1e-13):
+    np.testing.assert_allclose(sol.ts, singles.ts, rtol=0, atol=atol)
+    np.testing.assert_allclose(sol.ys, singles.ys, rtol=0, atol=atol)
+    np.testing.assert_array_equal(sol.failed, singles.result != dfx.RESULTS.successful)
+    for name, value in sol.stats.items():
+        if name == "num_projection_iterations":  # the last of them are decided by rounding
+            continue
+        np.testing.assert_allclose(value, singles.stats[name], rtol=0, atol=1e-10, err_msg=name)
+
+
+@pytest.mark.usefixtures("only_in_lanes")
+@pytest.mark.parametrize("name", HOOKS)
+def test_each_is_what_it_is_alone(name):
+    """Both directions of time, own parameters and ends, at the start, between and at the end."""
+    hook = HOOKS[name]
+    saveat = dfx.SaveAt(t0=True, ts=jnp.array([0.25, 0.5]), t1=True)
+    t1s = jnp.linspace(0.5, 2.0, SIZE)
+    options = dict(saveat=saveat, stepsize_controller=PID)
+    sol = mj.solve_ensemble(TURN, hook, 0.25, t1s, None, STARTS, RATES, lanes=LANES, **options)
+    single = jax.jit(jax.vmap(lambda t1, y, a: alone(hook, 0.25, t1, None, y, a, **options)))
+    assert_equal(sol, single(t1s, STARTS, RATES))
+    if name != "stabilized":
+        violation = np.abs(np.sum(np.square(sol.ys), -1) - 1)
+        assert violation.max() < 1e-15
+    assert sol.failures() == []
+
+
+@pytest.mark.usefixtures("only_in_lanes")
+def test_backwards_with_constant_steps_and_functions():
+    hook = HOOKS["projected"]
+    saveat = dfx.SaveAt(ts=jnp.array([0.4, 0.1]), fn=lambda t, y, args: t * y[0] + args)
+    run = lambda f, y, a: f(hook, 1.0, 0.0, -0.125, y, a, saveat=saveat)
+    ensemble = lambda hook, t0, *args, **options: mj.solve_ensemble(
+        TURN, hook, t0, *args, in_axes=None, lanes=LANES, **options
+    )
+    sol = run(ensemble, STARTS, jnp.asarray(2.0))
+    assert_equal(sol, jax.vmap(lambda y: run(alone, y, jnp.asarray(2.0)))(STARTS))
+    assert sol.ys.shape == (SIZE, 2)
+
+
+@pytest.mark.usefixtures("only_in_lanes")
+def test_a_failure_leaves_the_others_as_they_are():
+    hook = HOOKS["projected"]
+    solve = jax.jit(
+        lambda y, a: mj.solve_ensemble(
+            TURN, hook, 0.0, 2.0, None, y, a, lanes=LANES, stepsize_controller=PID, max_steps=2000
+        )
+    )
+    good = solve(STARTS, RATES)
+    starts = STARTS.at[1].set(jnp.nan).at[4].set(0.0)
+    bad = solve(starts, RATES.at[2].set(1e6))
+    others = np.array([0, 3, 5, 6])
+    np.testing.assert_array_equal(good.ys[others], bad.ys[others])
+    failures = dict(bad.failures())
+    assert list(failures) == [1, 2, 4]
+    assert "maximum number of solver steps" in failures[2]
+    with pytest.raises(RuntimeError, match="maximum number of solver steps"):
+        mj.solve_ensemble(
+            TURN,
+            hook,
+            0.0,
+            2.0,
+            None,
+            STARTS[:1],
+            jnp.array([1e6]),
+            stepsize_controller=PID,
+            max_steps=9,
+            throw=True,
+        )
+
+
+def test_gradients():
+    """With respect to what all have in common and to what each has of its own."""
+    hook = HOOKS["projected"]
+    solver = dict(stepsize_controller=PID)
+
+    def mean(values):
+        rate, y = values
+        ys = mj.solve_ensemble(
+            TURN, hook, 0.0, 1.0, None, y, rate, in_axes=None, lanes=LANES, **solver
+        ).ys
+        return jnp.mean(ys[..., 0] ** 2)
+
+    def mean_alone(values):
+        rate, y = values
+        ys = jax.vmap(lambda y: alone(hook, 0.0, 1.0, None, y, rate, **solver).ys)(y)
+        return jnp.mean(ys[..., 0] ** 2)
+
+    at = jnp.asarray(1.5), STARTS
+    for a, b in zip(jax.jit(jax.grad(mean))(at), jax.jit(jax.grad(mean_alone))(at), strict=True):
+        np.testing.assert_allclose(a, b, rtol=0, atol=1e-11)
+        assert np.abs(a).max() > 1e-3
+
+
+@pytest.mark.parametrize(
+    ("terms", "solver"),
+    [(TURN, mj.Projected(dfx.Kvaerno3(), CIRCLE)), (TURN, dfx.Bosh3())],
+    ids=["implicit", "without hook"],
+)
+def test_other_solvers_take_the_ordinary_way(terms, solver):
+    options = dict(stepsize_controller=PID)
+    sol = mj.solve_ensemble(terms, solver, 0.0, 0.5, 0.1, STARTS, RATES, lanes=LANES, **options)
+    single = jax.jit(jax.vmap(lambda y, a: alone(solver, 0.0, 0.5, 0.1, y, a, **options)))
+    assert_equal(sol, single(STARTS, RATES))
+
+
+def test_too_many_operations_take_the_ordinary_way(monkeypatch):
+    monkeypatch.setattr(module, "_LONGEST", 100)
+    sol = mj.solve_ensemble(TURN, HOOKS["projected"], 0.0, 0.5, 0.1, STARTS, RATES)
+    singles = jax.vmap(lambda y, a: alone(HOOKS["projected"], 0.0, 0.5, 0.1, y, a))
+    assert_equal(sol, singles(STARTS, RATES))
+
+
+@pytest.mark.usefixtures("as_a_user_meets_it")
+def test_bad_arguments():
+    def solve(t1=1.0, y=STARTS, args=RATES, **options):
+        return mj.solve_ensemble(TURN, HOOKS["projected"], 0.0, t1, 0.1, y, args, **options)
+
+    with pytest.raises(ValueError, match=r"Leading axes.*'y0s': 7, 'args': 2"):
+        solve(args=jnp.ones(2))
+    with pytest.raises(ValueError, match="`args` is one number.*in_axes"):
+        solve(args=1.0)
+    with pytest.raises(ValueError, match="no trajectories"):
+        solve(y=STARTS[:0], args=RATES[:0])
+    with pytest.raises(ValueError, match="`lanes` must be a positive integer"):
+        solve(lanes=0)
+    with pytest.raises(ValueError, match="`in_axes` must be 0 or None"):
+        solve(in_axes=1)
+    with pytest.raises(ValueError, match="`max_steps` must be"):
+        solve(max_steps=None)
+    with pytest.raises(TypeError, match="`y0s`"):
+        solve(y=jnp.ones((7, 2), int))
+    with pytest.raises(RuntimeError, match=r"`saveat.ts` must lie between"):
+        solve(saveat=dfx.SaveAt(ts=jnp.array([0.5, 1.5])))
+    with pytest.raises(RuntimeError, match=r"`saveat.ts` must be sorted"):
+        solve(saveat=dfx.SaveAt(ts=jnp.array([0.5, 0.2])))
