@@ -172,6 +172,8 @@ def test_bad_arguments():
         solve(max_steps=None)
     with pytest.raises(TypeError, match="`y0s`"):
         solve(y=jnp.ones((7, 2), int))
+    with pytest.raises(RuntimeError, match="`dt0` must have the sign"):
+        solve(t1=-1.0)
     with pytest.raises(RuntimeError, match=r"`saveat.ts` must lie between"):
         solve(saveat=dfx.SaveAt(ts=jnp.array([0.5, 1.5])))
     with pytest.raises(RuntimeError, match=r"`saveat.ts` must be sorted"):

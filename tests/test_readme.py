@@ -14,7 +14,7 @@ README = Path(__file__).parents[1] / "README.md"
 BLOCKS = re.findall(r"```python\n(.*?)```", README.read_text(), flags=re.DOTALL)
 # What the others need of the first one, as the text says: the imports and the setting.
 PREAMBLE = BLOCKS[0].split("\n\n\n")[0]
-NAMES = ["fifteen lines", "mechanism", "curves and minima", "fit", "extend"]
+NAMES = ["fifteen lines", "mechanism", "curves and minima", "fit", "ensemble", "extend"]
 
 
 def run(*blocks):
@@ -51,6 +51,14 @@ def check_fit(namespace):
     assert abs(fit.parameters["length"] - 1) < 3 * fit.standard_errors["length"] < 0.002
 
 
+def check_ensemble(namespace):
+    """On the circle, and with the energy of each."""
+    (q, v), start = (jax.tree.map(np.asarray, namespace[name]) for name in ("end", "drops"))
+    np.testing.assert_allclose(np.sum(q**2, axis=-1), 1, rtol=0, atol=1e-15)
+    energy = np.sum(v**2, axis=-1) / 2 + namespace["gravities"] * (q[:, 1] - start[:, 1])
+    assert np.abs(energy).max() < 1e-5
+
+
 def check_extend(namespace):
     """It asserts by itself what the text says; by Newton's method the same."""
     cylinder = namespace["Cylinder"]()
@@ -61,7 +69,14 @@ def check_extend(namespace):
     np.testing.assert_allclose(points, [[0.6, 0.8, 1.0]] * 2, atol=1e-15)
 
 
-CHECKS = (check_fifteen_lines, check_mechanism, check_curves_and_minima, check_fit, check_extend)
+CHECKS = (
+    check_fifteen_lines,
+    check_mechanism,
+    check_curves_and_minima,
+    check_fit,
+    check_ensemble,
+    check_extend,
+)
 
 
 @pytest.mark.parametrize("i", range(len(BLOCKS)), ids=NAMES)

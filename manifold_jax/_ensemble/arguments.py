@@ -59,6 +59,16 @@ def checked_batch(
     return Batch(each, common, time_dtype(*times, dt0, saveat), next(iter(sizes.values())))
 
 
+def checked_step(dt0: Any, batch: Batch) -> Any:
+    """Refuse, while running, a first step that leads away from the end of some trajectory."""
+    if dt0 is None:
+        return None
+    t0, t1 = jax.vmap(lambda each: batch.complete(each)[:2])(batch.each)
+    dt0 = jnp.asarray(dt0, batch.dtype)
+    message = "`dt0` must have the sign of t1 - t0 in all trajectories; None chooses it for each."
+    return eqx.error_if(dt0, jnp.any((t1 - t0) * dt0 < 0), message)
+
+
 def checked_times(saveat: dfx.SaveAt, batch: Batch) -> dfx.SaveAt:
     """Refuse, while running, times of `SaveAt(ts=...)` that some trajectory does not reach."""
 

@@ -29,8 +29,8 @@ class Lane(NamedTuple):
 
 
 class Totals(NamedTuple):
-    """Columns of all trajectories: the outcomes so far, how many rows were saved, and which; the next trajectory to
-    take, and how many have ended."""
+    """Columns of all trajectories: the outcomes so far, how many rows were saved, and which; the
+    next trajectory to take, and how many have ended."""
 
     outcomes: list[Array]
     rows: Array
@@ -50,8 +50,8 @@ class Run(NamedTuple):
 
 
 class Schedule:
-    """`given` has the trajectories in front of every array; `common` are the arguments that all
-    have in common, put together with those of each by `complete(of_each, common)`."""
+    """`given` is what each trajectory has of its own, the trajectories in front of every array;
+    `complete` adds to that of one what all have in common."""
 
     def __init__(self, equations: Equations, given: Any, complete: Any, lanes: int, limit: int):
         self.equations, self.complete = equations, complete

@@ -21,7 +21,7 @@ from .._solve.outcome import result_of_saved
 from .._solve.start import Consistent
 from .._solver.base import AbstractManifoldSolver
 from .._solver.explicit import is_unrollable
-from .arguments import Batch, checked_batch, checked_times
+from .arguments import Batch, checked_batch, checked_step, checked_times
 from .rows import saved_rows
 from .schedule import Schedule
 from .solution import EnsembleSolution
@@ -90,7 +90,7 @@ def solve_ensemble(
     batch = checked_batch(t0, t1, dt0, y0s, args, in_axes, saveat, lanes)
     if not isinstance(max_steps, int) or max_steps < 1:
         raise ValueError(f"`max_steps` must be a positive integer, got {max_steps!r}.")
-    saveat = checked_times(saveat, batch)
+    saveat, dt0 = checked_times(saveat, batch), checked_step(dt0, batch)
     common = Common(terms, solver, stepsize_controller, saveat, dt0, max_steps, consistent)
     solve = _in_lanes if _is_for_lanes(common, batch) else _mapped
     try:

@@ -1,0 +1,230 @@
+"""Many trajectories: `mj.solve_ensemble` next to `jax.vmap` and `jax.lax.map` of `mj.diffeqsolve`, and
+to SciPy.
+
+`python -m benchmarks.ensemble --json benchmarks/results/ensemble.json`
+
+Projected Tsit5, rtol = atol = 1e-6, the states at the end, from disturbed initial values that are made
+consistent; microseconds per step and trajectory on one core. `vmap` gets fewer trajectories, as its time
+grows with them; SciPy (DOP853, no constraint) gets three.
+"""
+
+import dataclasses
+import os
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Any, NamedTuple
+
+import diffrax as dfx
+import jax
+import jax.flatten_util as jfu
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+import typer
+from rich.table import Table
+from scipy.integrate import solve_ivp
+
+import manifold_jax as mj
+from manifold_jax.problems import Problem
+
+from ._measure import (
+    compiled,
+    CompileTime,
+    environment,
+    interleaved,
+    make_console,
+    Timing,
+    use_double_precision,
+    write_json,
+)
+
+
+TOLERANCE = 1e-6
+CONTROLLER = dfx.PIDController(rtol=TOLERANCE, atol=TOLERANCE)
+DISTURBANCE = 0.1
+PROBLEMS = ("pendulum", "double_pendulum", "rigid_body", "kepler", "slider_crank", "four_bar")
+
+
+@dataclasses.dataclass(frozen=True)
+class Row:
+    problem: str
+    method: str
+    trajectories: int
+    steps: float  # of a trajectory
+    violation: float
+    difference: float  # from the same trajectories one by one
+    compile_s: float | None
+    us_per_trajectory: float
+    us_per_step: float
+
+
+class Outcome(NamedTuple):
+    ys: Any
+    num_steps: Any
+
+
+def starts(problem: Problem, size: int) -> Any:
+    """Consistent; those that cannot be made so are left out."""
+    random = np.random.default_rng(0)
+    near = lambda x: np.asarray(x) + DISTURBANCE * random.normal(size=(2 * size, *np.shape(x)))
+    args = jtu.tree_map(jnp.asarray, problem.args)
+    consistent = lambda y: mj.consistent_state(problem.constraint, problem.t0, y, args, throw=False)
+    y0s, info = jax.vmap(consistent)(jtu.tree_map(lambda x: jnp.asarray(near(x)), problem.y0))
+    chosen = np.flatnonzero(np.asarray(info.success))[:size]
+    return jtu.tree_map(lambda x: x[chosen], y0s)
+
+
+def methods(problem: Problem, lanes: int) -> dict[str, Callable]:
+    hook, args = (
+        mj.Projected(dfx.Tsit5(), problem.constraint),
+        jtu.tree_map(jnp.asarray, problem.args),
+    )
+    common = problem.terms, hook, problem.t0, problem.t1, None
+
+    def one(y0: Any) -> Outcome:
+        sol = mj.diffeqsolve(*common, y0, args, stepsize_controller=CONTROLLER, throw=False)
+        return Outcome(sol.ys, sol.stats["num_steps"])
+
+    def ensemble(y0s: Any) -> Outcome:
+        sol = mj.solve_ensemble(
+            *common, y0s, args, in_axes=None, stepsize_controller=CONTROLLER, lanes=lanes
+        )
+        return Outcome(sol.ys, sol.stats["num_steps"])
+
+    return {
+        "solve_ensemble": ensemble,
+        "vmap": jax.vmap(one),
+        "lax.map in batches of 250": lambda y0s: jax.lax.map(one, y0s, batch_size=250),
+        "one by one": lambda y0s: jax.lax.map(one, y0s),
+    }
+
+
+def scipy_row(problem: Problem, y0s: Any) -> Row:
+    """Of the first three, with the vector field compiled by JAX."""
+    args = jtu.tree_map(jnp.asarray, problem.args)
+    _, unravel = jfu.ravel_pytree(problem.y0)
+    field = jax.jit(lambda t, y: jfu.ravel_pytree(problem.terms.vf(t, unravel(y), args))[0])
+    flat = [
+        np.asarray(jfu.ravel_pytree(jtu.tree_map(lambda x, i=i: x[i], y0s))[0]) for i in range(3)
+    ]
+    span = problem.t0, problem.t1
+    solve = lambda y: solve_ivp(
+        lambda t, y: np.asarray(field(t, y)), span, y, "DOP853", rtol=TOLERANCE, atol=TOLERANCE
+    )
+    solve(flat[0])
+    start = time.perf_counter()
+    sols = [solve(y) for y in flat]
+    seconds = (time.perf_counter() - start) / len(sols)
+    steps = float(np.mean([sol.t.size - 1 for sol in sols]))
+    ends = jax.vmap(unravel)(jnp.asarray(np.stack([sol.y[:, -1] for sol in sols])))
+    violation = largest_violation(problem, ends)
+    us = 1e6 * seconds
+    return Row(problem.name, "SciPy DOP853", 3, steps, violation, np.nan, None, us, us / steps)
+
+
+def largest_violation(problem: Problem, ends: Any) -> float:
+    args = jtu.tree_map(jnp.asarray, problem.args)
+    one = lambda y: mj.constraint_violation(problem.constraint, problem.t1, y, args)
+    return float(jnp.max(jax.vmap(one)(ends)))
+
+
+def measure(problem: Problem, size: int, lanes: int, repeats: int) -> list[Row]:
+    y0s = starts(problem, size)
+    few = jtu.tree_map(lambda x: x[: min(size, 1000)], y0s)
+    programs: dict[str, tuple[Callable, CompileTime]] = {}
+    for name, function in methods(problem, lanes).items():
+        programs[name] = compiled(function, y0s if name == "solve_ensemble" else few)
+    timings = interleaved({name: run for name, (run, _) in programs.items()}, repeats)
+    reference = programs["one by one"][0]()
+    rows = [
+        row_of(problem, name, run(), reference, seconds, timings[name])
+        for name, (run, seconds) in programs.items()
+    ]
+    return [*rows, scipy_row(problem, y0s)]
+
+
+def row_of(
+    problem: Problem,
+    name: str,
+    outcome: Outcome,
+    reference: Outcome,
+    seconds: CompileTime,
+    timing: Timing,
+) -> Row:
+    size, count = outcome.num_steps.shape[0], reference.num_steps.shape[0]
+    ends = jtu.tree_map(lambda x: x[:, -1], outcome.ys)
+    difference = max(
+        float(jnp.max(jnp.abs(a[:count] - b)))
+        for a, b in zip(jtu.tree_leaves(outcome.ys), jtu.tree_leaves(reference.ys), strict=True)
+    )
+    us = 1e3 * timing.median_ms
+    return Row(
+        problem.name,
+        name,
+        size,
+        float(jnp.mean(outcome.num_steps)),
+        largest_violation(problem, ends),
+        difference,
+        seconds.process_s,
+        us / size,
+        us / float(jnp.sum(outcome.num_steps)),
+    )
+
+
+def table_of(rows: list[Row]) -> Table:
+    table = Table(title="One core", title_justify="left")
+    table.add_column("problem", no_wrap=True)
+    table.add_column("method", no_wrap=True)
+    headings = ("trajectories", "steps", "max |g|", "difference", "compile, s", "us / trajectory")
+    for heading in (*headings, "us / step", "times ours"):
+        table.add_column(heading, justify="right")
+    ours = 1.0
+    for r in rows:
+        if r.method == "solve_ensemble":
+            table.add_section()
+            ours = r.us_per_trajectory
+        table.add_row(
+            r.problem,
+            r.method,
+            str(r.trajectories),
+            f"{r.steps:.0f}",
+            f"{r.violation:.0e}",
+            f"{r.difference:.0e}",
+            "" if r.compile_s is None else f"{r.compile_s:.1f}",
+            f"{r.us_per_trajectory:.3g}",
+            f"{r.us_per_step:.3g}",
+            f"{r.us_per_trajectory / ours:.1f}",
+        )
+    return table
+
+
+def use_one_core() -> None:
+    if hasattr(os, "sched_setaffinity"):
+        os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
+
+
+def main(
+    json: Annotated[Path | None, typer.Option(metavar="FILE", help="Write results here.")] = None,
+    size: Annotated[int, typer.Option(min=4, help="Trajectories.")] = 4000,
+    lanes: Annotated[int, typer.Option(min=1, help="That advance together.")] = 128,
+    repeats: Annotated[int, typer.Option(min=1, help="Timed runs of each program.")] = 3,
+    problems: Annotated[str, typer.Option(metavar="NAME,...")] = ",".join(PROBLEMS),
+) -> None:
+    """Measure ensembles next to `vmap`, `lax.map` and SciPy."""
+    use_one_core()
+    use_double_precision()
+    console = make_console()
+    with console.status("measuring"):
+        rows = []
+        for name in problems.split(","):
+            rows += measure(getattr(mj.problems, name)(), size, lanes, repeats)
+    console.print(table_of(rows))
+    if json is not None:
+        settings = {"rtol": TOLERANCE, "lanes": lanes, "disturbance": DISTURBANCE}
+        content = {"environment": environment(), "settings": settings}
+        write_json(json, {**content, "rows": [dataclasses.asdict(row) for row in rows]})
+
+
+if __name__ == "__main__":
+    typer.run(main)
