@@ -87,4 +87,5 @@ def _solver_state(
     execution = execution_of(solver.inner, terms, t0, t1, y0, args)
     if isinstance(solver, Stabilized) or not isinstance(execution, WrittenOut):
         return None
-    return HookState.initial(execution.memory_of(first.field), t0, t1, y0)
+    memory = first.field if execution.remembers_field else None
+    return HookState.initial(memory, t0, t1, y0)

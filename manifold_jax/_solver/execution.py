@@ -69,11 +69,12 @@ class WrittenOut(AbstractExecution):
     in_a_loop: bool | None = None  # as is faster
 
     def initial_memory(self, terms, frame, t0, t1, y0, args):
-        return self.memory_of(terms.vf(t0, y0, args))
+        return terms.vf(t0, y0, args) if self.remembers_field else None
 
-    def memory_of(self, field: Any) -> Any:
-        """The vector field at the end of a step, if the next one begins with it."""
-        return field if is_first_same_as_last(self._tableau) else None
+    @property
+    def remembers_field(self) -> bool:
+        """Whether the memory is the vector field at the state, as steps end with it."""
+        return is_first_same_as_last(self._tableau)
 
     def step(self, terms, frame, t0, t1, y0, args, memory, made_jump) -> Step:
         evaluate = lambda: terms.vf(t0, y0, args)
