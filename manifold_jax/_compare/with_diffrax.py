@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._solve import diffeqsolve
+from .._solver import Stabilized
 from .approaches import Approach, Formulation, with_vector_field
 from .task import as_rows, Run, SolveFailed, Task
 from .timing import median_ms
@@ -170,5 +171,9 @@ def _explicit_evaluations(task: Task, solve: Formulation, steps: int) -> int | N
     assert isinstance(tableau, dfx.ButcherTableau)  # several are for several vector fields
     reused = tableau.fsal and tableau.ssal
     in_steps = 1 + (tableau.num_stages - 1) * steps if reused else tableau.num_stages * steps
-    # Two evaluations choose the first step (Diffrax starts with 0.01 whatever the problem).
-    return in_steps + (2 if solve.function is diffeqsolve else 0)
+    if solve.function is not diffeqsolve:
+        return in_steps
+    # Two evaluations choose the first step (Diffrax starts with 0.01 whatever the problem), of which
+    # the first is the one at the start, unless it is the stabilized field that is needed there.
+    shared = reused and not isinstance(solve.solver, Stabilized)
+    return in_steps + (1 if shared else 2)
