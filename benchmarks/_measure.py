@@ -140,6 +140,12 @@ def _versions(packages: tuple[str, ...]) -> dict[str, str]:
     return versions
 
 
+def use_one_core() -> None:
+    """The compiler's threads take turns, so that they do not slow each other down."""
+    if hasattr(os, "sched_setaffinity"):
+        os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
+
+
 def use_double_precision() -> None:
     """Settings of all benchmarks. Compiled programs are not taken from the disk."""
     jax.config.update("jax_enable_x64", True)

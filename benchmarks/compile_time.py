@@ -9,7 +9,6 @@ those by the clock depend on what else the machine does.
 
 import dataclasses
 import functools
-import os
 import statistics
 import time
 from collections.abc import Callable
@@ -33,6 +32,7 @@ from ._measure import (
     milliseconds,
     Timing,
     use_double_precision,
+    use_one_core,
     write_json,
 )
 
@@ -210,12 +210,6 @@ def ratio_table(found: list[Ratio]) -> Table:
             r.problem, r.program, f"{r.run:.2f}", f"{r.compile:.2f}", f"<= {r.goal:g}", met
         )
     return table
-
-
-def use_one_core() -> None:
-    """The compiler's threads take turns, so that they do not slow each other down."""
-    if hasattr(os, "sched_setaffinity"):
-        os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
 
 
 def main(

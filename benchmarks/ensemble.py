@@ -9,7 +9,6 @@ grows with them; SciPy (DOP853, no constraint) gets three.
 """
 
 import dataclasses
-import os
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -36,6 +35,7 @@ from ._measure import (
     make_console,
     Timing,
     use_double_precision,
+    use_one_core,
     write_json,
 )
 
@@ -197,11 +197,6 @@ def table_of(rows: list[Row]) -> Table:
             f"{r.us_per_trajectory / ours:.1f}",
         )
     return table
-
-
-def use_one_core() -> None:
-    if hasattr(os, "sched_setaffinity"):
-        os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
 
 
 def main(

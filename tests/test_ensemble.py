@@ -111,6 +111,24 @@ def test_a_failure_leaves_the_others_as_they_are():
         )
 
 
+@pytest.mark.usefixtures("only_in_lanes")
+def test_a_saved_value_that_cannot_be_corrected():
+    """Is a failure of that trajectory, and not of the next one in its lane."""
+
+    def g(t, y, args):
+        return y @ y - 1 + jnp.where((args > 2) & (jnp.abs(t - 0.3) < 0.01), jnp.nan, 0.0)
+
+    hook = mj.Projected(dfx.Bosh3(), mj.Constraint(g))
+    options = dict(saveat=dfx.SaveAt(ts=jnp.array([0.2, 0.3, 0.4])))
+    rates = RATES[::-1]  # those that fail come first
+    sol = mj.solve_ensemble(TURN, hook, 0.0, 0.5, 0.125, STARTS, rates, lanes=LANES, **options)
+    single = jax.jit(jax.vmap(lambda y, a: alone(hook, 0.0, 0.5, 0.125, y, a, **options)))
+    assert_equal(sol, single(STARTS, rates))
+    np.testing.assert_array_equal(sol.failed, rates > 2)
+    undefined = np.outer(rates > 2, [False, True, False])
+    np.testing.assert_array_equal(np.isnan(sol.ys).any(axis=2), undefined)
+
+
 def test_gradients():
     """With respect to what all have in common and to what each has of its own."""
     hook = HOOKS["projected"]

@@ -1,5 +1,7 @@
 """Constrained mechanics: accelerations, multipliers, corrections, against NumPy written anew."""
 
+from fractions import Fraction
+
 import diffrax as dfx
 import equinox as eqx
 import jax
@@ -97,6 +99,34 @@ def test_masses_that_could_be_of_bodies_or_of_coordinates():
         else:
             with pytest.raises(ValueError, match=r"`mass_matrix`.*'b': \(1,\)"):
                 system.accelerations(0.7, pair)
+
+
+def exact_solution(A, b):
+    """By elimination in rational numbers."""
+    rows = [[Fraction(x) for x in (*row, c)] for row, c in zip(A.tolist(), b.tolist())]
+    for k in range(len(rows)):
+        pivot = max(range(k, len(rows)), key=lambda i: abs(rows[i][k]))
+        rows[k], rows[pivot] = rows[pivot], rows[k]
+        for i in range(len(rows)):
+            if i != k:
+                factor = rows[i][k] / rows[k][k]
+                rows[i] = [x - factor * y for x, y in zip(rows[i], rows[k])]
+    return np.array([float(row[-1] / row[k]) for k, row in enumerate(rows)])
+
+
+def test_light_bodies_beside_heavy_ones():
+    """In a full mass matrix they keep their digits: 1e-12 of the mass costs 1e-11, the condition of
+    the Schur complement, not 1e-5."""
+    masses = np.array([1.0, 1e-12, 1e-12, 1.0])
+    M = np.sqrt(np.outer(masses, masses)) * (np.eye(4) + 0.1)
+    C, force = np.array([[1.0, 1.0, 1.0, 0.5]]), masses * [0.3, 0.7, -0.2, 1.0]
+    system = mj.MechanicalSystem(
+        jnp.asarray(M), lambda t, q, args: jnp.asarray(C) @ q, lambda *_: jnp.asarray(force)
+    )
+    _, acceleration = system.terms.vf(0.0, (jnp.zeros(4), jnp.zeros(4)), None)
+    A = np.block([[M, C.T], [C, np.zeros((1, 1))]])
+    expected = exact_solution(A, np.append(force, 0.0))[:4]
+    np.testing.assert_allclose(acceleration, expected, rtol=1e-9)
 
 
 def test_singular_mass_matrix_with_regular_system():

@@ -16,7 +16,7 @@ class EnsembleSolution(eqx.Module):
 
     - `ts`: the times of what was saved, `(N, T)`; infinite where a trajectory did not get there.
     - `ys`: the saved values, `(N, T, ...)`.
-    - `stats`: as of [`diffeqsolve`][], each of shape `(N,)`.
+    - `stats`: as of [`diffeqsolve`][] without `max_steps`, each of shape `(N,)`.
     - `result`: the result codes of all trajectories.
     """
 

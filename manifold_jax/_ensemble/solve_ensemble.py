@@ -1,5 +1,6 @@
 """The front end of ensembles."""
 
+import dataclasses
 from typing import Any
 
 import diffrax as dfx
@@ -92,34 +93,22 @@ def solve_ensemble(
     if not isinstance(max_steps, int) or max_steps < 1:
         raise ValueError(f"`max_steps` must be a positive integer, got {max_steps!r}.")
     saveat, dt0 = checked_times(saveat, batch), checked_step(dt0, batch)
-    common = Common(terms, solver, stepsize_controller, saveat, dt0, max_steps, consistent)
-    solve = _in_lanes if _is_for_lanes(common, batch) else _mapped
+    equations = Equations(terms, solver, stepsize_controller, saveat, dt0, max_steps, consistent)
+    solve = _in_lanes if _is_for_lanes(equations, batch) else _mapped
     try:
-        solution = solve((common, batch), lanes)
+        solution = solve((equations, batch), lanes)
     except NotScalarError:
-        solution = _mapped((common, batch), lanes)
+        solution = _mapped((equations, batch), lanes)
     return _raise_if_any_failed(solution) if throw else solution
 
 
-class Common(eqx.Module):
-    """The arguments that all trajectories have in common."""
-
-    terms: Any
-    solver: dfx.AbstractSolver
-    controller: dfx.AbstractStepSizeController
-    saveat: dfx.SaveAt
-    dt0: RealScalarLike | None
-    max_steps: int = eqx.field(static=True)
-    consistent: Consistent = eqx.field(static=True)
-
-
-def _is_for_lanes(common: Common, batch: Batch) -> bool:
-    one, saveat, solver = batch.one(), common.saveat, common.solver
+def _is_for_lanes(equations: Equations, batch: Batch) -> bool:
+    one, saveat, solver = batch.one(), equations.saveat, equations.solver
     return (
         isinstance(solver, AbstractManifoldSolver)
-        and isinstance(common.terms, dfx.ODETerm | DirectedTerm)
-        and is_unrollable(solver.inner, common.terms, one.t0, one.t1, one.y0, one.args)
-        and type(common.controller) in (dfx.PIDController, dfx.ConstantStepSize)
+        and isinstance(equations.terms, dfx.ODETerm | DirectedTerm)
+        and is_unrollable(solver.inner, equations.terms, one.t0, one.t1, one.y0, one.args)
+        and type(equations.controller) in (dfx.PIDController, dfx.ConstantStepSize)
         and isinstance(saveat.subs, dfx.SubSaveAt)
         and not (saveat.dense or saveat.subs.steps or saveat.solver_state)
         and not (saveat.controller_state or saveat.made_jump)
@@ -127,18 +116,10 @@ def _is_for_lanes(common: Common, batch: Batch) -> bool:
 
 
 @eqx.filter_custom_vjp
-def _in_lanes(inputs: tuple[Common, Batch], lanes: int) -> EnsembleSolution:
-    common, batch = inputs
-    solver = common.solver.within(common.controller, bends_interpolant=False)
-    equations = Equations(
-        common.terms,
-        solver,
-        common.controller,
-        common.saveat,
-        common.dt0,
-        common.max_steps,
-        common.consistent,
-    )
+def _in_lanes(inputs: tuple[Equations, Batch], lanes: int) -> EnsembleSolution:
+    equations, batch = inputs
+    solver = equations.solver.within(equations.controller, bends_interpolant=False)
+    equations = dataclasses.replace(equations, solver=solver)
     run = Schedule(equations, batch.each, batch.complete, lanes, _LONGEST).run()
     outcome, statistics = run.outcome, run.outcome.statistics
     stats = {
@@ -150,10 +131,10 @@ def _in_lanes(inputs: tuple[Common, Batch], lanes: int) -> EnsembleSolution:
         "largest_correction": statistics.largest_correction,
         "correction_share": jax.vmap(lambda s: s.correction_share)(statistics),
     }
-    ts, ys = saved_rows(common.saveat.subs, batch, run)
+    ts, ys = saved_rows(equations.saveat.subs, batch, run)
     result = outcome.result
     if not solver.corrects_output:
-        finite = jax.vmap(lambda ts, ys: result_of_saved(common.saveat, ts, ys))(ts, ys)
+        finite = jax.vmap(lambda ts, ys: result_of_saved(equations.saveat, ts, ys))(ts, ys)
         result = jax.vmap(update_result)(result, finite)
     return EnsembleSolution(ts, ys, stats, result)
 
@@ -183,23 +164,23 @@ def _in_lanes_bwd(residuals, cotangents, perturbed, inputs, lanes):
     return pullback(bar)[0]
 
 
-def _mapped(inputs: tuple[Common, Batch], lanes: int) -> EnsembleSolution:
-    common, batch = inputs
+def _mapped(inputs: tuple[Equations, Batch], lanes: int) -> EnsembleSolution:
+    equations, batch = inputs
 
     def one(of_each: Any) -> tuple[Any, ...]:
         given: Given = batch.complete(of_each)
         sol = diffeqsolve(
-            common.terms,
-            common.solver,
+            equations.terms,
+            equations.solver,
             given.t0,
             given.t1,
-            common.dt0,
+            equations.dt0,
             given.y0,
             given.args,
-            saveat=common.saveat,
-            stepsize_controller=common.controller,
-            max_steps=common.max_steps,
-            consistent=common.consistent,
+            saveat=equations.saveat,
+            stepsize_controller=equations.controller,
+            max_steps=equations.max_steps,
+            consistent=equations.consistent,
             throw=False,
         )
         stats = {name: x for name, x in sol.stats.items() if name != "max_steps"}

@@ -7,6 +7,7 @@ that many of them can be advanced by a loop of another kind.
 from typing import Any, NamedTuple
 
 import diffrax as dfx
+import equinox as eqx
 import jax.numpy as jnp
 import jax.tree_util as jtu
 from diffrax import RESULTS
@@ -16,7 +17,6 @@ from .._custom_types import Args, BoolScalar, FloatScalar, IntScalar, RealScalar
 from .._solve.prepare import prepare
 from .._solve.start import Consistent
 from .._solver.advance import HookState, StepStatistics
-from .._solver.base import AbstractManifoldSolver
 
 
 class Trajectory(NamedTuple):
@@ -71,16 +71,16 @@ class Outcome(NamedTuple):
     statistics: StepStatistics
 
 
-class Equations(NamedTuple):
+class Equations(eqx.Module):
     """What all trajectories have in common."""
 
     terms: dfx.AbstractTerm
-    solver: AbstractManifoldSolver
+    solver: dfx.AbstractSolver  # for lanes one of this library
     controller: dfx.AbstractStepSizeController
     saveat: dfx.SaveAt
     dt0: RealScalarLike | None
-    max_steps: int
-    consistent: Consistent
+    max_steps: int = eqx.field(static=True)
+    consistent: Consistent = eqx.field(static=True)
 
     def begin(self, given: Given) -> Start:
         solver, (t0, t1, y0, args) = self.solver, given

@@ -95,10 +95,20 @@ def factorize_mass(M: Float[Array, "..."], C: Float[Array, "m n"]) -> Mass:
         return Mass(jnp.where(positive, M, 1), None, None, yes, positive)
     asymmetry = jnp.max(jnp.abs(M - M.T))
     symmetric = asymmetry <= 100 * jnp.finfo(M.dtype).eps * jnp.max(jnp.abs(M))
-    size = jnp.maximum(jnp.sum(C * C, axis=1), jnp.finfo(M.dtype).tiny)
-    weights = jax.lax.stop_gradient(jnp.trace(M) / M.shape[0] / size)
+    weights = jax.lax.stop_gradient(_weights(M, C))
     factorization = _factorize_positive(M + gram((C * weights[:, None]).T, C.T))
     return Mass(None, factorization, weights, symmetric, factorization.full_rank)
+
+
+def _weights(M: Float[Array, "n n"], C: Float[Array, "m n"]) -> Float[Array, " m"]:
+    """The diagonal of `D`, `1 / (C diag(M)^-1 C^T)_ii`: then no entry of `C_i^T D_i C_i` exceeds
+    `sqrt(M_jj M_kk)`, and light bodies keep their digits beside heavy ones. Diagonal entries that
+    are zero to rounding count as the mean."""
+    diagonal = jnp.diagonal(M)
+    mean, eps = jnp.mean(jnp.abs(diagonal)), jnp.finfo(M.dtype).eps
+    masses = jnp.where(diagonal > 10 * eps * mean, diagonal, mean)
+    size = jnp.sum(C * C / masses[None, :], axis=1)
+    return 1 / jnp.maximum(size, jnp.finfo(M.dtype).tiny)
 
 
 def _factorize_positive(M: Float[Array, "n n"]) -> Factorization:
