@@ -12,6 +12,8 @@ import manifold_jax as mj
 
 
 module = importlib.import_module("manifold_jax._ensemble.solve_ensemble")
+in_lanes = importlib.import_module("manifold_jax._ensemble.in_lanes")
+reverse = importlib.import_module("manifold_jax._ensemble.reverse")
 PID = dfx.PIDController(rtol=1e-6, atol=1e-6)
 CIRCLE = mj.Constraint(lambda t, y, args: y @ y - 1)
 TURN = dfx.ODETerm(lambda t, y, args: args * jnp.stack([-y[1], y[0]]) * (1 + y[0] ** 2 * t))
@@ -33,7 +35,9 @@ def only_in_lanes(monkeypatch):
     def refuse(*args):
         raise AssertionError("not in lanes")
 
-    monkeypatch.setattr(module, "_mapped", refuse)
+    monkeypatch.setattr(module, "solve_mapped", refuse)
+    monkeypatch.setattr(in_lanes, "gradient_of_mapped", refuse)
+    monkeypatch.setattr(in_lanes, "tangents_of_mapped", refuse)
 
 
 def alone(hook, t0, t1, dt0, y0, args, **options):
@@ -129,27 +133,103 @@ def test_a_saved_value_that_cannot_be_corrected():
     np.testing.assert_array_equal(np.isnan(sol.ys).any(axis=2), undefined)
 
 
-def test_gradients():
-    """With respect to what all have in common and to what each has of its own."""
-    hook = HOOKS["projected"]
-    solver = dict(stepsize_controller=PID)
+def gradients(hook, saveat, t1s, loss):
+    """Of `loss(ys)` with respect to what all have in common, and to what each has of its own: in lanes,
+    and by trajectories alone; and forwards in lanes, along a random direction."""
+    options = dict(saveat=saveat, stepsize_controller=PID)
 
-    def mean(values):
-        rate, y = values
+    def field(t, y, args):
+        common, own = args
+        return common * own * TURN.vector_field(t, y, 1.0)
+
+    terms = dfx.ODETerm(field)
+
+    def together(values, adjoint=mj.StepReplayAdjoint()):
+        common, own, y = values
         ys = mj.solve_ensemble(
-            TURN, hook, 0.0, 1.0, None, y, rate, in_axes=None, lanes=LANES, **solver
+            terms,
+            hook,
+            0.0,
+            t1s,
+            None,
+            y,
+            (common, own),
+            in_axes=(None, 0),
+            lanes=LANES,
+            adjoint=adjoint,
+            **options,
         ).ys
-        return jnp.mean(ys[..., 0] ** 2)
+        return loss(ys)
 
-    def mean_alone(values):
-        rate, y = values
-        ys = jax.vmap(lambda y: alone(hook, 0.0, 1.0, None, y, rate, **solver).ys)(y)
-        return jnp.mean(ys[..., 0] ** 2)
+    def each_alone(values):
+        common, own, y = values
 
-    at = jnp.asarray(1.5), STARTS
-    for a, b in zip(jax.jit(jax.grad(mean))(at), jax.jit(jax.grad(mean_alone))(at), strict=True):
+        def one(t1, own, y):
+            args = common, own
+            return mj.diffeqsolve(terms, hook, 0.0, t1, None, y, args, throw=False, **options).ys
+
+        return loss(jax.vmap(one)(t1s, own, y))
+
+    at = jnp.asarray(0.8), RATES, STARTS
+    along = jnp.asarray(0.3), jnp.cos(RATES), jnp.sin(5 * STARTS)
+    forwards = lambda at: together(at, dfx.ForwardMode())
+    _, slope = jax.jit(lambda: jax.jvp(forwards, (at,), (along,)))()
+    found, expected = jax.jit(jax.grad(together))(at), jax.jit(jax.grad(each_alone))(at)
+    np.testing.assert_allclose(slope, sum(map(jnp.vdot, expected, along)), rtol=0, atol=1e-11)
+    return found, expected
+
+
+@pytest.mark.usefixtures("only_in_lanes")
+@pytest.mark.parametrize(
+    ("name", "saveat", "segments"),
+    [
+        ("projected", dfx.SaveAt(t0=True, ts=jnp.array([0.0, 0.25, 0.5]), t1=True), True),
+        pytest.param("stabilized", dfx.SaveAt(t1=True), False, marks=pytest.mark.slow),
+        pytest.param(
+            "charts",
+            dfx.SaveAt(ts=jnp.array([0.1, 0.2, 0.6]), fn=lambda t, y, args: y * args[1]),
+            True,
+            marks=pytest.mark.slow,
+        ),
+    ],
+)
+def test_gradients(name, saveat, segments, monkeypatch):
+    """The record of a segment has few steps: several of them for each trajectory."""
+    if segments:
+        monkeypatch.setattr(reverse, "_BYTES", 1000)
+    t1s = jnp.linspace(1.0, 0.7, SIZE)
+    found, expected = gradients(HOOKS[name], saveat, t1s, lambda ys: jnp.mean(jnp.sin(3 * ys)))
+    for a, b in zip(found, expected, strict=True):
         np.testing.assert_allclose(a, b, rtol=0, atol=1e-11)
         assert np.abs(a).max() > 1e-3
+
+
+@pytest.mark.usefixtures("only_in_lanes")
+def test_gradient_beside_a_failure():
+    """A trajectory that nothing depends on adds nothing, also if its steps have no derivative."""
+
+    def field(t, y, args):
+        defined = jnp.where(args > 2, 0.3 - t, 1.0)
+        return jnp.sqrt(defined) * TURN.vector_field(t, y, args)
+
+    def mean(rates, size):
+        sol = mj.solve_ensemble(
+            dfx.ODETerm(field),
+            HOOKS["projected"],
+            0.0,
+            0.5,
+            0.125,
+            STARTS[:size],
+            rates[:size],
+            lanes=LANES,
+        )
+        return jnp.sum(jnp.where(sol.failed[:, None, None], 0.0, sol.ys) ** 3)
+
+    assert RATES[3] < 2 < RATES[4]
+    gradient = jax.jit(jax.grad(mean), static_argnums=1)
+    some, all = gradient(RATES, 4), gradient(RATES, SIZE)
+    assert np.abs(some).max() > 1e-3
+    np.testing.assert_array_equal(some, all)
 
 
 @pytest.mark.parametrize(
@@ -165,7 +245,7 @@ def test_other_solvers_take_the_ordinary_way(terms, solver):
 
 
 def test_too_many_operations_take_the_ordinary_way(monkeypatch):
-    monkeypatch.setattr(module, "_LONGEST", 100)
+    monkeypatch.setattr(in_lanes, "_LONGEST", 100)
     sol = mj.solve_ensemble(TURN, HOOKS["projected"], 0.0, 0.5, 0.1, STARTS, RATES)
     singles = jax.vmap(lambda y, a: alone(HOOKS["projected"], 0.0, 0.5, 0.1, y, a))
     assert_equal(sol, singles(STARTS, RATES))

@@ -59,3 +59,16 @@ def taken(columns: list[jax.Array], index: jax.Array) -> list[jax.Array]:
 
 def where(chosen: jax.Array, a: list[jax.Array], b: list[jax.Array]) -> list[jax.Array]:
     return [jax.lax.select(chosen, x, y) for x, y in zip(a, b, strict=True)]
+
+
+def stacked(columns: list[jax.Array]) -> dict[str, jax.Array]:
+    """One array for each type of number."""
+    groups: dict[str, list[jax.Array]] = {}
+    for column in columns:
+        groups.setdefault(str(column.dtype), []).append(column)
+    return {dtype: jnp.stack(group) for dtype, group in groups.items()}
+
+
+def unstacked(stacks: dict[str, jax.Array], dtypes: list[Any]) -> list[jax.Array]:
+    rows = {dtype: iter(stack) for dtype, stack in stacks.items()}
+    return [next(rows[str(dtype)]) for dtype in dtypes]

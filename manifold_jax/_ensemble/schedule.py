@@ -10,7 +10,7 @@ from jaxtyping import Array
 
 from .._scalar import call_in_lanes, Lanes
 from .columns import columns_of_arrays, columns_of_values, Layout, taken, where
-from .trajectory import Equations, Given, Outcome, Start
+from .trajectory import Outcome, Start
 
 
 # Steps between two looks at which lanes have ended. A lane waits half of them on average.
@@ -50,10 +50,11 @@ class Run(NamedTuple):
 
 
 class Schedule:
-    """`given` is what each trajectory has of its own, the trajectories in front of every array;
-    `complete` adds to that of one what all have in common."""
+    """`equations` are [`Equations`][], or have their methods; `given` is what each trajectory has of
+    its own, the trajectories in front of every array; `complete` makes of that of one what the
+    methods are given."""
 
-    def __init__(self, equations: Equations, given: Any, complete: Any, lanes: int, limit: int):
+    def __init__(self, equations: Any, given: Any, complete: Any, lanes: int, limit: int):
         self.equations, self.complete = equations, complete
         self.size = jtu.tree_leaves(given)[0].shape[0]
         self.count = min(lanes, self.size)
@@ -156,7 +157,7 @@ class Schedule:
         with self.lanes.inside(lane.state[0]):
             state = layout.values(lane.state)
 
-            def attempt(given: Given, trajectory: Any) -> tuple[Any, Any]:
+            def attempt(given: Any, trajectory: Any) -> tuple[Any, Any]:
                 goes_on = self.equations.goes_on(given, trajectory)
                 return goes_on, self.equations.attempt(given, trajectory)
 

@@ -1,37 +1,27 @@
 """The front end of ensembles."""
 
-import dataclasses
 from typing import Any
 
 import diffrax as dfx
 import equinox as eqx
-import jax
 import jax.numpy as jnp
-import jax.tree_util as jtu
 from jaxtyping import Array
 
 from .._adjoint import StepReplayAdjoint
-from .._compat import messages_of_results, number_of_result, update_result
+from .._compat import messages_of_results, number_of_result
 from .._custom_types import Args, RealScalarLike, Y
 from .._directed_term import DirectedTerm
 from .._errors import clear_errors
 from .._scalar import NotScalarError
 from .._solve.arguments import check_arguments
-from .._solve.diffeqsolve import diffeqsolve
-from .._solve.outcome import result_of_saved
 from .._solve.start import Consistent
 from .._solver.base import AbstractManifoldSolver
 from .._solver.explicit import is_unrollable
 from .arguments import Batch, checked_batch, checked_step, checked_times
-from .rows import saved_rows
-from .schedule import Schedule
+from .in_lanes import solve_in_lanes, solve_in_lanes_forwards
+from .mapped import solve_mapped
 from .solution import EnsembleSolution
-from .trajectory import Equations, Given
-
-
-# Operations on one number, of a start and a step, beyond which trajectories are mapped over instead. A
-# double pendulum has 3389; the 16308 of a four-bar linkage take 72 s to compile, and half of the time.
-_LONGEST = 8_000
+from .trajectory import Equations
 
 
 @clear_errors
@@ -50,6 +40,7 @@ def solve_ensemble(
     max_steps: int = 4096,
     in_axes: Any = 0,
     lanes: int = 128,
+    adjoint: dfx.AbstractAdjoint = StepReplayAdjoint(),
     throw: bool = False,
     consistent: Consistent = "project",
 ) -> EnsembleSolution:
@@ -71,6 +62,8 @@ def solve_ensemble(
         leading axis, `None` for what is common to all; a prefix of the tree of `args`.
     - `saveat`: the end, `SaveAt(t1=True)`, the start, times (common to all), and functions of them.
     - `lanes`: how many trajectories advance together.
+    - `adjoint`: the mode of differentiation: reverse, or `diffrax.ForwardMode()` for `jax.jvp` and
+        `jax.jacfwd`. Both make the steps again that the solve made.
     - `throw`: raise a `RuntimeError` if any trajectory fails. By default it has a result code, and
         the others are what they are without it.
 
@@ -87,18 +80,21 @@ def solve_ensemble(
 
     As `diffeqsolve`, and `ValueError` for leading axes that disagree.
     """
-    adjoint = StepReplayAdjoint()
     check_arguments(terms, solver, dt0, saveat, stepsize_controller, adjoint, None, consistent)
     batch = checked_batch(t0, t1, dt0, y0s, args, in_axes, saveat, lanes)
     if not isinstance(max_steps, int) or max_steps < 1:
         raise ValueError(f"`max_steps` must be a positive integer, got {max_steps!r}.")
     saveat, dt0 = checked_times(saveat, batch), checked_step(dt0, batch)
-    equations = Equations(terms, solver, stepsize_controller, saveat, dt0, max_steps, consistent)
-    solve = _in_lanes if _is_for_lanes(equations, batch) else _mapped
+    equations = Equations(
+        terms, solver, stepsize_controller, saveat, dt0, adjoint, max_steps, consistent
+    )
+    forwards = isinstance(adjoint, dfx.ForwardMode)
+    in_lanes = solve_in_lanes_forwards if forwards else solve_in_lanes
+    solve = in_lanes if _is_for_lanes(equations, batch) else solve_mapped
     try:
         solution = solve((equations, batch), lanes)
     except NotScalarError:
-        solution = _mapped((equations, batch), lanes)
+        solution = solve_mapped((equations, batch), lanes)
     return _raise_if_any_failed(solution) if throw else solution
 
 
@@ -112,81 +108,8 @@ def _is_for_lanes(equations: Equations, batch: Batch) -> bool:
         and isinstance(saveat.subs, dfx.SubSaveAt)
         and not (saveat.dense or saveat.subs.steps or saveat.solver_state)
         and not (saveat.controller_state or saveat.made_jump)
+        and isinstance(equations.adjoint, StepReplayAdjoint | dfx.ForwardMode)
     )
-
-
-@eqx.filter_custom_vjp
-def _in_lanes(inputs: tuple[Equations, Batch], lanes: int) -> EnsembleSolution:
-    equations, batch = inputs
-    solver = equations.solver.within(equations.controller, bends_interpolant=False)
-    equations = dataclasses.replace(equations, solver=solver)
-    run = Schedule(equations, batch.each, batch.complete, lanes, _LONGEST).run()
-    outcome, statistics = run.outcome, run.outcome.statistics
-    stats = {
-        "num_steps": outcome.num_steps,
-        "num_accepted_steps": outcome.num_accepted,
-        "num_rejected_steps": outcome.num_steps - outcome.num_accepted,
-        "initial_correction": run.start.correction,
-        "num_projection_iterations": statistics.iterations,
-        "largest_correction": statistics.largest_correction,
-        "correction_share": jax.vmap(lambda s: s.correction_share)(statistics),
-    }
-    ts, ys = saved_rows(equations.saveat.subs, batch, run)
-    result = outcome.result
-    if not solver.corrects_output:
-        finite = jax.vmap(lambda ts, ys: result_of_saved(equations.saveat, ts, ys))(ts, ys)
-        result = jax.vmap(update_result)(result, finite)
-    return EnsembleSolution(ts, ys, stats, result)
-
-
-@_in_lanes.def_fwd
-def _in_lanes_fwd(perturbed, inputs, lanes):
-    del perturbed
-    return _in_lanes(inputs, lanes), None
-
-
-@_in_lanes.def_bwd
-def _in_lanes_bwd(residuals, cotangents, perturbed, inputs, lanes):
-    """Through the same trajectories, each by the way back of `diffeqsolve`."""
-    del residuals
-    smooth, rest = eqx.partition(inputs, perturbed)
-
-    def saved(smooth: Any) -> Any:
-        solution = _mapped(eqx.combine(smooth, rest), lanes)
-        return eqx.filter((solution.ts, solution.ys), eqx.is_inexact_array)
-
-    values, pullback = jax.vjp(saved, smooth)
-    bar = jtu.tree_map(
-        lambda x, b: jnp.zeros_like(x) if b is None else b,
-        values,
-        (cotangents.ts, cotangents.ys),
-    )
-    return pullback(bar)[0]
-
-
-def _mapped(inputs: tuple[Equations, Batch], lanes: int) -> EnsembleSolution:
-    equations, batch = inputs
-
-    def one(of_each: Any) -> tuple[Any, ...]:
-        given: Given = batch.complete(of_each)
-        sol = diffeqsolve(
-            equations.terms,
-            equations.solver,
-            given.t0,
-            given.t1,
-            equations.dt0,
-            given.y0,
-            given.args,
-            saveat=equations.saveat,
-            stepsize_controller=equations.controller,
-            max_steps=equations.max_steps,
-            consistent=equations.consistent,
-            throw=False,
-        )
-        stats = {name: x for name, x in sol.stats.items() if name != "max_steps"}
-        return sol.ts, sol.ys, stats, sol.result
-
-    return EnsembleSolution(*jax.lax.map(one, batch.each, batch_size=min(lanes, batch.size)))
 
 
 def _raise_if_any_failed(solution: EnsembleSolution) -> EnsembleSolution:

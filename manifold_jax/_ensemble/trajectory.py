@@ -79,6 +79,7 @@ class Equations(eqx.Module):
     controller: dfx.AbstractStepSizeController
     saveat: dfx.SaveAt
     dt0: RealScalarLike | None
+    adjoint: dfx.AbstractAdjoint
     max_steps: int = eqx.field(static=True)
     consistent: Consistent = eqx.field(static=True)
 

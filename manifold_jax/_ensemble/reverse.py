@@ -1,0 +1,274 @@
+"""Reverse mode of many trajectories in lanes: forwards once more, then back step by step.
+
+Lanes go together and are not refilled, but hold trajectories of about as many steps. States are
+recorded for one segment of the steps at a time; of the others there is the first state.
+"""
+
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jax import lax
+from jaxtyping import Array
+
+from .._scalar import call_in_lanes, Lanes, Value
+from .columns import columns_of_arrays, columns_of_values, Layout, stacked, taken, unstacked, where
+from .functions import Functions, smooth_of
+from .parts import Parts
+from .trajectory import Trajectory
+
+
+# Of the record of a segment.
+_BYTES = 2**22
+
+
+class Ends(NamedTuple):
+    """Of all trajectories, in front of every array: the states they begin with, numbers of steps and of
+    saved rows; cotangents of the first and the last states and of the values at `ts`."""
+
+    start: Trajectory
+    num_steps: Array
+    rows: Array
+    first_bar: Any
+    last_bar: Any
+    values_bar: Any
+
+
+class Group(NamedTuple):
+    """Columns of those that go together: which they are, and whether anything depends on them."""
+
+    index: Array
+    present: Array
+    each: list[Array]
+    rest: list[Array]
+
+
+class Bars(NamedTuple):
+    """Columns of cotangents so far, of the state and of what steps depend on; the last row of saved
+    values still to come."""
+
+    state: list[Array]
+    each: list[Array]
+    common: list[Array]
+    row: Array
+
+
+class Record(NamedTuple):
+    """Of the steps of a segment: where they begin and end, from which state; which were accepted."""
+
+    steps: dict[str, Array]
+    accepted: Array
+
+
+class WayBack:
+    def __init__(self, parts: Parts, ends: Ends, lanes: int, limit: int):
+        self.parts, self.ends = parts, ends
+        self.functions = Functions(parts, jtu.tree_map(lambda x: x[0], ends.start.solver_state))
+        self.size = ends.num_steps.size
+        self.lanes = Lanes(min(lanes, self.size), limit)
+        self.each, self.rest = (columns_of_arrays(x) for x in (parts.each, parts.rest_each))
+        self.each_layout, self.rest_layout = (_of_one(x) for x in (parts.each, parts.rest_each))
+        self.starts, self.state_layout = columns_of_arrays(ends.start), _of_one(ends.start)
+        self.smooth_layout = _of_one(smooth_of(ends.start))
+        self.common = jtu.tree_map(Value.of_constant, parts.common)
+        self.common_columns = columns_of_values(self.common, self.lanes)  # not in a loop first
+        equations = parts.rest[0]
+        self.max_steps, self.ts = equations.max_steps, equations.saveat.subs.ts
+        rows = jtu.tree_map(lambda x: x.reshape(-1, *x.shape[2:]), ends.values_bar)
+        self.values_bar, self.values_layout = columns_of_arrays(rows), _of_one(rows)
+        self.needed = self._needed()
+
+    def run(self) -> tuple[Any, Any]:
+        """Cotangents of `parts.each` and of `parts.common`."""
+        count = self.lanes.count
+        groups = -(-self.size // count)
+        order = jnp.argsort(self.ends.num_steps)
+        index = jnp.full(groups * count, self.size).at[: self.size].set(order)
+        start = self._empty_record(), [jnp.zeros_like(x) for x in self.common_columns]
+        (_, common), each = lax.scan(self._through_group, start, index.reshape(groups, count))
+        each = [
+            jnp.zeros_like(x, shape=self.size).at[order].set(x.ravel()[: self.size]) for x in each
+        ]
+        total = Layout.of(self.parts.common).arrays([jnp.sum(x, keepdims=True) for x in common])
+        return self.each_layout.arrays(each), jtu.tree_map(lambda x: x[0], total)
+
+    def _needed(self) -> Array:
+        """Which trajectories anything depends on. The steps of one that failed may have no
+        derivative."""
+        bars = self.ends.first_bar, self.ends.last_bar, self.ends.values_bar
+        used = [jnp.any(x.reshape(self.size, -1) != 0, axis=1) for x in jtu.tree_leaves(bars)]
+        return jnp.any(jnp.stack(used), axis=0)
+
+    def _empty_record(self) -> Record:
+        time = self.ends.start.tprev.dtype
+        self.record_dtypes = [time, time, *_dtypes(self.smooth_layout)]
+        one = stacked([jnp.zeros(self.lanes.count, dtype) for dtype in self.record_dtypes])
+        rows = max(_BYTES // sum(x.nbytes for x in one.values()), 1)
+        self.rows = min(rows, self.max_steps)
+        steps = {k: jnp.zeros((self.rows, *x.shape), x.dtype) for k, x in one.items()}
+        return Record(steps, jnp.zeros((self.rows, self.lanes.count), bool))
+
+    def _through_group(self, carry: Any, index: Array) -> tuple[Any, list[Array]]:
+        record, common = carry
+        with self.lanes.inside():
+            present = index < self.size
+            index = jnp.minimum(index, self.size - 1)
+            each, rest = taken(self.each, index), taken(self.rest, index)
+            group = Group(index, present & self.needed[index], each, rest)
+            last = taken(columns_of_arrays(self.ends.last_bar), index)
+            zeros = [jnp.zeros(index.size, d) for d in _dtypes(self.smooth_layout)[len(last) :]]
+            none = [jnp.zeros_like(x) for x in each]
+            bars = Bars([*last, *zeros], none, common, self.ends.rows[index] - 1)
+            bars, record = self._through_segments(group, bars, record)
+            first = taken(columns_of_arrays(self.ends.first_bar), index)
+            bar = [x + y for x, y in zip(bars.state, first, strict=False)] + bars.state[
+                len(first) :
+            ]
+            bar = self.smooth_layout.values(bar)
+            through = self._call(self.functions.through_start, group, bar)
+            bars = self._including(bars, group.present, *through)
+            return (record, bars.common), bars.each
+
+    def _through_segments(self, group: Group, bars: Bars, record: Record) -> tuple[Bars, Record]:
+        """On to the last one, storing where each begins, and back."""
+        state, dtypes = taken(self.starts, group.index), _dtypes(self.state_layout)
+        segments = -(-self.max_steps // self.rows)
+        room = lambda x: jnp.zeros((segments, *x.shape), x.dtype).at[0].set(x)
+        firsts = {k: room(x) for k, x in stacked(state).items()}
+
+        def through_segment(carry: Any) -> Any:
+            k, onwards, firsts, record, bars = carry
+            with self.lanes.inside():
+                state = unstacked({d: x[k] for d, x in firsts.items()}, dtypes)
+                num_rows, unfinished, state, record = self._forwards(group, state, record)
+                onwards = onwards & unfinished
+                bars = self._backwards(group, jnp.where(onwards, 0, num_rows), record, bars)
+                after = stacked(state)  # is not read again on the way back
+                firsts = {d: x.at[k + 1].set(after[d], mode="drop") for d, x in firsts.items()}
+                return jnp.where(onwards, k + 1, k - 1), onwards, firsts, record, bars
+
+        start = jnp.asarray(0), jnp.asarray(True), firsts, record, bars
+        *_, record, bars = lax.while_loop(lambda carry: carry[0] >= 0, through_segment, start)
+        return bars, record
+
+    def _forwards(self, group: Group, state: list[Array], record: Record) -> tuple[Any, ...]:
+        """The steps of a segment, which are recorded; whether some lane goes on behind it."""
+
+        def goes_on(state: list[Array]) -> Array:
+            trajectory = self.state_layout.values(state)
+            goes_on = self._call(self.functions.goes_on, group, trajectory)
+            return self._column(goes_on) & group.present
+
+        def step(carry: Any) -> Any:
+            row, active, state, record = carry
+            with self.lanes.inside(state[0]):
+                before = self.state_layout.values(state)
+                tried = self._call(self.functions.attempt, group, before)
+                x = columns_of_values((before.tprev, before.tnext, smooth_of(before)), self.lanes)
+                accepted = active & self._column(tried.kept)
+                record = _with_row(record, row, stacked(x), accepted)
+                state = where(active, columns_of_values(tried.trajectory, self.lanes), state)
+                return row + 1, goes_on(state), state, record
+
+        with self.lanes.inside():
+            start = jnp.asarray(0), goes_on(state), state, record
+        unfinished = lambda carry: (carry[0] < self.rows) & jnp.any(carry[1])
+        row, active, state, record = lax.while_loop(unfinished, step, start)
+        return row, jnp.any(active), state, record
+
+    def _backwards(self, group: Group, num_rows: Array, record: Record, bars: Bars) -> Bars:
+        # Fetched one step ahead: XLA would copy the slices into every kernel that needs them.
+        fetched = lambda row: jtu.tree_map(lambda x: x[jnp.maximum(row, 0)], record)
+
+        def back(carry: Any) -> Any:
+            row, step, bars = carry
+            columns = unstacked(step.steps, self.record_dtypes)
+            with self.lanes.inside(columns[0]):
+                bars = self._through_step(group, step.accepted, columns, bars)
+            return row - 1, fetched(row - 1), bars
+
+        start = num_rows - 1, fetched(num_rows - 1), bars
+        return lax.while_loop(lambda carry: carry[0] >= 0, back, start)[-1]
+
+    def _through_step(
+        self, group: Group, accepted: Array, columns: list[Array], bars: Bars
+    ) -> Bars:
+        layout = Layout.of(self.ends.start.tprev[0])
+        start, end = (layout.values([x]) for x in columns[:2])
+        state = self.smooth_layout.values(columns[2:])
+        dense_info, pullback = self._call(self.functions.step, group, start, end, state)
+        if self.ts is None:
+            zero = lambda value: Value.of_constant(jnp.zeros(value.shape, value.dtype))
+            dense_bar = jtu.tree_map(zero, dense_info)
+        else:
+            bars, dense_bar = self._through_rows(group, accepted, columns[:2], dense_info, bars)
+        bar = self.smooth_layout.values(bars.state), dense_bar
+        transpose = lambda pullback, bar: pullback(bar)
+        *through, state_bar = call_in_lanes(self.lanes, transpose, pullback, bar)
+        state_bar = columns_of_values(state_bar, self.lanes)
+        bars = self._including(bars, accepted, *through)
+        return bars._replace(state=where(accepted, state_bar, bars.state))
+
+    def _through_rows(
+        self, group: Group, accepted: Array, ends: list[Array], dense_info: Any, bars: Bars
+    ) -> tuple[Bars, Any]:
+        """The values saved in a step."""
+        info, layout = columns_of_values(dense_info, self.lanes), Layout.of(dense_info)
+        time, num_rows = Layout.of(self.ends.start.tprev[0]), self.ts.size
+        direction = self._column(self._call(self.functions.direction, group))
+        at = lambda row: self.ts.astype(ends[0].dtype)[jnp.maximum(row, 0)] * direction
+        due = lambda row: accepted & (row >= 0) & (at(row) > ends[0])
+
+        def through_row(carry: Any) -> Any:
+            bars, dense_bar = carry
+            here, row = due(bars.row), bars.row
+            with self.lanes.inside():
+                place = group.index * num_rows + jnp.maximum(row, 0)
+                bar = self.values_layout.values(taken(self.values_bar, place))
+                times = (time.values([x]) for x in (at(row), *ends))
+                *through, more = self._call(
+                    self.functions.through_value, group, *times, layout.values(info), bar
+                )
+                more = columns_of_values(more, self.lanes)
+                bars = self._including(bars, here, *through)
+                bars = bars._replace(row=row - here.astype(row.dtype))
+                return bars, _added(dense_bar, more, here)
+
+        start = bars, [jnp.zeros_like(x) for x in info]
+        bars, bar = lax.while_loop(lambda c: jnp.any(due(c[0].row)), through_row, start)
+        return bars, layout.values(bar)
+
+    def _including(self, bars: Bars, active: Array, each: Any, common: Any) -> Bars:
+        each, common = (columns_of_values(x, self.lanes) for x in (each, common))
+        return bars._replace(
+            each=_added(bars.each, each, active), common=_added(bars.common, common, active)
+        )
+
+    def _call(self, function: Callable, group: Group, *args: Any) -> Any:
+        each, rest = self.each_layout.values(group.each), self.rest_layout.values(group.rest)
+        return call_in_lanes(self.lanes, function, each, self.common, rest, *args)
+
+    def _column(self, value: Any) -> Array:
+        return columns_of_values(value, self.lanes)[0]
+
+
+def _of_one(tree: Any) -> Layout:
+    return Layout.of(jtu.tree_map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), tree))
+
+
+def _dtypes(layout: Layout) -> list[Any]:
+    """Of the columns."""
+    each = zip(layout.shapes, layout.dtypes, strict=True)
+    return [dtype for shape, dtype in each for _ in range(math.prod(shape))]
+
+
+def _with_row(record: Record, row: Array, steps: dict[str, Array], accepted: Array) -> Record:
+    steps = {dtype: x.at[row].set(steps[dtype]) for dtype, x in record.steps.items()}
+    return Record(steps, record.accepted.at[row].set(accepted))
+
+
+def _added(totals: list[Array], more: list[Array], active: Array) -> list[Array]:
+    return [a + jnp.where(active, b, 0) for a, b in zip(totals, more, strict=True)]
