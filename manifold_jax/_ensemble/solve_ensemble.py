@@ -8,6 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
+from jax.sharding import Mesh
 from jaxtyping import Array
 
 from .._adjoint import StepReplayAdjoint
@@ -23,6 +24,7 @@ from .._solve.start import Consistent
 from .._solver.base import AbstractManifoldSolver
 from .._solver.explicit import is_unrollable
 from .arguments import Batch, checked_batch, checked_step, checked_times
+from .devices import check_mesh, over_devices
 from .rows import saved_rows
 from .schedule import Schedule
 from .solution import EnsembleSolution
@@ -50,6 +52,7 @@ def solve_ensemble(
     max_steps: int = 4096,
     in_axes: Any = 0,
     lanes: int = 128,
+    mesh: Mesh | None = None,
     throw: bool = False,
     consistent: Consistent = "project",
 ) -> EnsembleSolution:
@@ -87,6 +90,8 @@ def solve_ensemble(
 
     As `diffeqsolve`, and `ValueError` for leading axes that disagree.
     """
+    if mesh is not None:
+        check_mesh(mesh)
     adjoint = StepReplayAdjoint()
     check_arguments(terms, solver, dt0, saveat, stepsize_controller, adjoint, None, consistent)
     batch = checked_batch(t0, t1, dt0, y0s, args, in_axes, saveat, lanes)
@@ -94,12 +99,20 @@ def solve_ensemble(
         raise ValueError(f"`max_steps` must be a positive integer, got {max_steps!r}.")
     saveat, dt0 = checked_times(saveat, batch), checked_step(dt0, batch)
     equations = Equations(terms, solver, stepsize_controller, saveat, dt0, max_steps, consistent)
-    solve = _in_lanes if _is_for_lanes(equations, batch) else _mapped
-    try:
-        solution = solve((equations, batch), lanes)
-    except NotScalarError:
-        solution = _mapped((equations, batch), lanes)
+    inputs = equations, batch
+    if mesh is None:
+        solution = _on_one_device(inputs, lanes)
+    else:
+        solution = over_devices(lambda inputs: _on_one_device(inputs, lanes), inputs, mesh)
     return _raise_if_any_failed(solution) if throw else solution
+
+
+def _on_one_device(inputs: tuple[Equations, Batch], lanes: int) -> EnsembleSolution:
+    solve = _in_lanes if _is_for_lanes(*inputs) else _mapped
+    try:
+        return solve(inputs, lanes)
+    except NotScalarError:
+        return _mapped(inputs, lanes)
 
 
 def _is_for_lanes(equations: Equations, batch: Batch) -> bool:
