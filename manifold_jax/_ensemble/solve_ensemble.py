@@ -24,6 +24,7 @@ from .._solve.start import Consistent
 from .._solver.base import AbstractManifoldSolver
 from .._solver.explicit import is_unrollable
 from .arguments import Batch, checked_batch, checked_step, checked_times
+from .axes import anywhere, Axes, largest
 from .devices import check_mesh, over_devices
 from .rows import saved_rows
 from .schedule import Schedule
@@ -91,20 +92,24 @@ def solve_ensemble(
     As `diffeqsolve`, and `ValueError` for leading axes that disagree.
     """
     if mesh is not None:
-        check_mesh(mesh)
+        check_mesh(mesh, solver)
     adjoint = StepReplayAdjoint()
     check_arguments(terms, solver, dt0, saveat, stepsize_controller, adjoint, None, consistent)
     batch = checked_batch(t0, t1, dt0, y0s, args, in_axes, saveat, lanes)
     if not isinstance(max_steps, int) or max_steps < 1:
         raise ValueError(f"`max_steps` must be a positive integer, got {max_steps!r}.")
-    saveat, dt0 = checked_times(saveat, batch), checked_step(dt0, batch)
     equations = Equations(terms, solver, stepsize_controller, saveat, dt0, max_steps, consistent)
-    inputs = equations, batch
-    if mesh is None:
+
+    def solve(inputs: tuple[Equations, Batch], axes: Axes = ()) -> EnsembleSolution:
+        equations, batch = inputs
+        saveat = checked_times(equations.saveat, batch, axes)
+        dt0 = checked_step(equations.dt0, batch, axes)
+        inputs = dataclasses.replace(equations, saveat=saveat, dt0=dt0), batch
         solution = _on_one_device(inputs, lanes)
-    else:
-        solution = over_devices(lambda inputs: _on_one_device(inputs, lanes), inputs, mesh)
-    return _raise_if_any_failed(solution) if throw else solution
+        return _raise_if_any_failed(solution, axes) if throw else solution
+
+    inputs = equations, batch
+    return solve(inputs) if mesh is None else over_devices(solve, inputs, mesh)
 
 
 def _on_one_device(inputs: tuple[Equations, Batch], lanes: int) -> EnsembleSolution:
@@ -202,7 +207,7 @@ def _mapped(inputs: tuple[Equations, Batch], lanes: int) -> EnsembleSolution:
     return EnsembleSolution(*jax.lax.map(one, batch.each, batch_size=min(lanes, batch.size)))
 
 
-def _raise_if_any_failed(solution: EnsembleSolution) -> EnsembleSolution:
-    failed = solution.failed
-    number = jnp.max(jnp.where(failed, number_of_result(solution.result), 0))
-    return eqx.branched_error_if(solution, jnp.any(failed), number, messages_of_results())
+def _raise_if_any_failed(solution: EnsembleSolution, axes: Axes) -> EnsembleSolution:
+    number = largest(jnp.where(solution.failed, number_of_result(solution.result), 0), axes)
+    failed = anywhere(solution.failed, axes)
+    return eqx.branched_error_if(solution, failed, number, messages_of_results())
