@@ -11,7 +11,7 @@ import pytest
 import manifold_jax as mj
 
 
-module = importlib.import_module("manifold_jax._ensemble.solve_ensemble")
+execution = importlib.import_module("manifold_jax._ensemble.execution")
 in_lanes = importlib.import_module("manifold_jax._ensemble.in_lanes")
 reverse = importlib.import_module("manifold_jax._ensemble.reverse")
 PID = dfx.PIDController(rtol=1e-6, atol=1e-6)
@@ -35,7 +35,7 @@ def only_in_lanes(monkeypatch):
     def refuse(*args):
         raise AssertionError("not in lanes")
 
-    monkeypatch.setattr(module, "solve_mapped", refuse)
+    monkeypatch.setattr(execution, "solve_mapped", refuse)
     monkeypatch.setattr(in_lanes, "gradient_of_mapped", refuse)
     monkeypatch.setattr(in_lanes, "tangents_of_mapped", refuse)
 
@@ -234,13 +234,18 @@ def test_gradient_beside_a_failure():
 
 
 @pytest.mark.parametrize(
-    ("terms", "solver"),
-    [(TURN, mj.Projected(dfx.Kvaerno3(), CIRCLE)), (TURN, dfx.Bosh3())],
+    ("solver", "reason"),
+    [
+        (mj.Projected(dfx.Kvaerno3(), CIRCLE), "Kvaerno3 is not an explicit"),
+        (dfx.Bosh3(), "Bosh3 without a hook"),
+    ],
     ids=["implicit", "without hook"],
 )
-def test_other_solvers_take_the_ordinary_way(terms, solver):
+def test_other_solvers_take_the_ordinary_way(solver, reason):
     options = dict(stepsize_controller=PID)
-    sol = mj.solve_ensemble(terms, solver, 0.0, 0.5, 0.1, STARTS, RATES, lanes=LANES, **options)
+    sol = mj.solve_ensemble(TURN, solver, 0.0, 0.5, 0.1, STARTS, RATES, lanes=LANES, **options)
+    assert sol.execution.startswith("mapped over")
+    assert reason in sol.execution
     single = jax.jit(jax.vmap(lambda y, a: alone(solver, 0.0, 0.5, 0.1, y, a, **options)))
     assert_equal(sol, single(STARTS, RATES))
 
@@ -248,6 +253,7 @@ def test_other_solvers_take_the_ordinary_way(terms, solver):
 def test_too_many_operations_take_the_ordinary_way(monkeypatch):
     monkeypatch.setattr(in_lanes, "_LONGEST", 100)
     sol = mj.solve_ensemble(TURN, HOOKS["projected"], 0.0, 0.5, 0.1, STARTS, RATES)
+    assert "more than 100 operations" in sol.execution
     singles = jax.vmap(lambda y, a: alone(HOOKS["projected"], 0.0, 0.5, 0.1, y, a))
     assert_equal(sol, singles(STARTS, RATES))
 

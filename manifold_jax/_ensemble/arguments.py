@@ -12,6 +12,7 @@ import numpy as np
 from .._constraint_checks import check_state
 from .._custom_types import Args, Y
 from .._solve.prepare import time_dtype
+from .axes import anywhere, Axes
 from .trajectory import Given
 
 
@@ -59,17 +60,17 @@ def checked_batch(
     return Batch(each, common, time_dtype(*times, dt0, saveat), next(iter(sizes.values())))
 
 
-def checked_step(dt0: Any, batch: Batch) -> Any:
+def checked_step(dt0: Any, batch: Batch, axes: Axes) -> Any:
     """Refuse, while running, a first step that leads away from the end of some trajectory."""
     if dt0 is None:
         return None
     t0, t1 = jax.vmap(lambda each: batch.complete(each)[:2])(batch.each)
     dt0 = jnp.asarray(dt0, batch.dtype)
     message = "`dt0` must have the sign of t1 - t0 in all trajectories; None chooses it for each."
-    return eqx.error_if(dt0, jnp.any((t1 - t0) * dt0 < 0), message)
+    return eqx.error_if(dt0, anywhere((t1 - t0) * dt0 < 0, axes), message)
 
 
-def checked_times(saveat: dfx.SaveAt, batch: Batch) -> dfx.SaveAt:
+def checked_times(saveat: dfx.SaveAt, batch: Batch, axes: Axes) -> dfx.SaveAt:
     """Refuse, while running, times of `SaveAt(ts=...)` that some trajectory does not reach."""
 
     def checked(sub: dfx.SubSaveAt) -> dfx.SubSaveAt:
@@ -80,8 +81,8 @@ def checked_times(saveat: dfx.SaveAt, batch: Batch) -> dfx.SaveAt:
         direction = jnp.where(t0 < t1, 1, -1).astype(ts.dtype)[:, None]
         ahead = ts[None] * direction
         before, behind = t0[:, None] * direction, t1[:, None] * direction
-        outside = jnp.any(ahead < before) | jnp.any(ahead > behind)
-        unsorted = jnp.any(ahead[:, 1:] < ahead[:, :-1])
+        outside = anywhere((ahead < before) | (ahead > behind), axes)
+        unsorted = anywhere(ahead[:, 1:] < ahead[:, :-1], axes)
         ts = eqx.error_if(ts, unsorted, "`saveat.ts` must be sorted from t0 to t1.")
         ts = eqx.error_if(
             ts, outside, "`saveat.ts` must lie between t0 and t1 of all trajectories."

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 
-from .._scalar import Lanes, object_array, Value
+from .._scalar import example, Lanes, object_array, Value
 
 
 class Layout(NamedTuple):
@@ -22,6 +22,11 @@ class Layout(NamedTuple):
         """Of a tree of [`Value`][]s, or of arrays of one trajectory."""
         leaves, treedef = jtu.tree_flatten(tree)
         return Layout(treedef, [x.shape for x in leaves], [x.dtype for x in leaves])
+
+    def example(self) -> Any:
+        """To trace functions of one trajectory with."""
+        leaves = [example(s, d) for s, d in zip(self.shapes, self.dtypes, strict=True)]
+        return jtu.tree_unflatten(self.treedef, leaves)
 
     def values(self, columns: list[jax.Array]) -> Any:
         out, k = [], 0

@@ -8,13 +8,12 @@ import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 from jax import lax
 from jaxtyping import Array
 
-from .._scalar import call_in_lanes, Lanes, Value
+from .._scalar import call_in_lanes, example, Lanes, Value
 from .columns import columns_of_arrays, columns_of_values, Layout, stacked, taken, unstacked, where
 from .functions import Functions, smooth_of
 from .parts import Parts
@@ -256,7 +255,7 @@ class WayBack:
 
 
 def _of_one(tree: Any) -> Layout:
-    return Layout.of(jtu.tree_map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), tree))
+    return Layout.of(jtu.tree_map(lambda x: example(x.shape[1:], x.dtype), tree))
 
 
 def _dtypes(layout: Layout) -> list[Any]:

@@ -8,7 +8,7 @@ import jax.tree_util as jtu
 from jax import lax
 from jaxtyping import Array
 
-from .._scalar import call_in_lanes, Lanes
+from .._scalar import call_in_lanes, example, Lanes
 from .columns import columns_of_arrays, columns_of_values, Layout, taken, where
 from .trajectory import Outcome, Start
 
@@ -60,9 +60,7 @@ class Schedule:
         self.count = min(lanes, self.size)
         self.lanes = Lanes(self.count, limit)
         self.given = columns_of_arrays(given)
-        self.given_layout = Layout.of(
-            jtu.tree_map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), given)
-        )
+        self.given_layout = Layout.of(jtu.tree_map(lambda x: example(x.shape[1:], x.dtype), given))
         self.ts = equations.saveat.subs.ts
 
     def run(self) -> Run:
@@ -133,11 +131,7 @@ class Schedule:
 
     def _layouts(self, state_layout: Layout) -> tuple[Layout, Layout | None]:
         """Of outcomes and of saved values."""
-        example = lambda layout: jtu.tree_unflatten(
-            layout.treedef,
-            [jax.ShapeDtypeStruct(s, d) for s, d in zip(layout.shapes, layout.dtypes, strict=True)],
-        )
-        given, state = example(self.given_layout), example(state_layout)
+        given, state = self.given_layout.example(), state_layout.example()
 
         def outcome(given, state):
             return self.equations.outcome(self.complete(given), state, jnp.asarray(False))

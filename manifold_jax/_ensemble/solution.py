@@ -18,12 +18,14 @@ class EnsembleSolution(eqx.Module):
     - `ys`: the saved values, `(N, T, ...)`.
     - `stats`: as of [`diffeqsolve`][] without `max_steps`, each of shape `(N,)`.
     - `result`: the result codes of all trajectories.
+    - `execution`: "in lanes", or why not.
     """
 
     ts: PyTree[Array]
     ys: PyTree[Array]
     stats: dict[str, Any]
     result: RESULTS
+    execution: str = eqx.field(static=True, default="in lanes")
 
     @property
     def failed(self) -> Array:
@@ -31,7 +33,14 @@ class EnsembleSolution(eqx.Module):
         return ~jax.vmap(is_okay)(self.result)
 
     def failures(self, most: int = 10) -> list[tuple[int, str]]:
-        """Numbers and reasons of the first that failed; not under `jit`."""
-        numbers = np.flatnonzero(np.asarray(self.failed))[:most]
-        codes, messages = np.asarray(number_of_result(self.result)), messages_of_results()
-        return [(int(i), messages[codes[i]]) for i in numbers]
+        """Numbers and reasons of the first that failed; not under `jit`. Of several processes each
+        lists those of its own devices."""
+        codes, messages = number_of_result(self.result), messages_of_results()
+        successful, failed = number_of_result(RESULTS.successful), {}
+        for shard in codes.addressable_shards:
+            part = np.asarray(shard.data)
+            first = shard.index[0].start or 0
+            failed |= {
+                first + int(i): messages[part[i]] for i in np.flatnonzero(part != successful)
+            }
+        return sorted(failed.items())[:most]

@@ -1,25 +1,25 @@
 """The front end of ensembles."""
 
+import dataclasses
 from typing import Any
 
 import diffrax as dfx
 import equinox as eqx
 import jax.numpy as jnp
+from jax.sharding import Mesh
 from jaxtyping import Array
 
 from .._adjoint import StepReplayAdjoint
 from .._compat import messages_of_results, number_of_result
 from .._custom_types import Args, RealScalarLike, Y
-from .._directed_term import DirectedTerm
 from .._errors import clear_errors
-from .._scalar import NotScalarError
 from .._solve.arguments import check_arguments
 from .._solve.start import Consistent
-from .._solver.base import AbstractManifoldSolver
-from .._solver.explicit import is_unrollable
-from .arguments import Batch, checked_batch, checked_step, checked_times
-from .in_lanes import solve_in_lanes, solve_in_lanes_forwards
-from .mapped import solve_mapped
+from .arguments import checked_batch, checked_step, checked_times
+from .axes import anywhere, Axes, largest
+from .devices import check_mesh, over_devices
+from .execution import solve_on_one_device
+from .parts import Inputs
 from .solution import EnsembleSolution
 from .trajectory import Equations
 
@@ -41,6 +41,7 @@ def solve_ensemble(
     in_axes: Any = 0,
     lanes: int = 128,
     adjoint: dfx.AbstractAdjoint = StepReplayAdjoint(),
+    mesh: Mesh | None = None,
     throw: bool = False,
     consistent: Consistent = "project",
 ) -> EnsembleSolution:
@@ -69,7 +70,8 @@ def solve_ensemble(
 
     Explicit Runge-Kutta methods with constant steps or `diffrax.PIDController` are advanced so. Other
     solvers, other controllers and systems too large to be written out number by number are solved
-    by `diffeqsolve` under `jax.lax.map` in batches of `lanes`.
+    by `diffeqsolve` under `jax.lax.map` in batches of `lanes`. `execution` of the solution says which
+    way was taken, and why.
 
     **Returns:**
 
@@ -80,39 +82,29 @@ def solve_ensemble(
 
     As `diffeqsolve`, and `ValueError` for leading axes that disagree.
     """
+    if mesh is not None:
+        check_mesh(mesh, solver)
     check_arguments(terms, solver, dt0, saveat, stepsize_controller, adjoint, None, consistent)
     batch = checked_batch(t0, t1, dt0, y0s, args, in_axes, saveat, lanes)
     if not isinstance(max_steps, int) or max_steps < 1:
         raise ValueError(f"`max_steps` must be a positive integer, got {max_steps!r}.")
-    saveat, dt0 = checked_times(saveat, batch), checked_step(dt0, batch)
     equations = Equations(
         terms, solver, stepsize_controller, saveat, dt0, adjoint, max_steps, consistent
     )
-    forwards = isinstance(adjoint, dfx.ForwardMode)
-    in_lanes = solve_in_lanes_forwards if forwards else solve_in_lanes
-    solve = in_lanes if _is_for_lanes(equations, batch) else solve_mapped
-    try:
-        solution = solve((equations, batch), lanes)
-    except NotScalarError:
-        solution = solve_mapped((equations, batch), lanes)
-    return _raise_if_any_failed(solution) if throw else solution
+
+    def solve(inputs: Inputs, axes: Axes = ()) -> EnsembleSolution:
+        equations, batch = inputs
+        saveat = checked_times(equations.saveat, batch, axes)
+        dt0 = checked_step(equations.dt0, batch, axes)
+        inputs = dataclasses.replace(equations, saveat=saveat, dt0=dt0), batch
+        solution = solve_on_one_device(inputs, lanes)
+        return _raise_if_any_failed(solution, axes) if throw else solution
+
+    inputs = equations, batch
+    return solve(inputs) if mesh is None else over_devices(solve, inputs, mesh)
 
 
-def _is_for_lanes(equations: Equations, batch: Batch) -> bool:
-    one, saveat, solver = batch.one(), equations.saveat, equations.solver
-    return (
-        isinstance(solver, AbstractManifoldSolver)
-        and isinstance(equations.terms, dfx.ODETerm | DirectedTerm)
-        and is_unrollable(solver.inner, equations.terms, one.t0, one.t1, one.y0, one.args)
-        and type(equations.controller) in (dfx.PIDController, dfx.ConstantStepSize)
-        and isinstance(saveat.subs, dfx.SubSaveAt)
-        and not (saveat.dense or saveat.subs.steps or saveat.solver_state)
-        and not (saveat.controller_state or saveat.made_jump)
-        and isinstance(equations.adjoint, StepReplayAdjoint | dfx.ForwardMode)
-    )
-
-
-def _raise_if_any_failed(solution: EnsembleSolution) -> EnsembleSolution:
-    failed = solution.failed
-    number = jnp.max(jnp.where(failed, number_of_result(solution.result), 0))
-    return eqx.branched_error_if(solution, jnp.any(failed), number, messages_of_results())
+def _raise_if_any_failed(solution: EnsembleSolution, axes: Axes) -> EnsembleSolution:
+    number = largest(jnp.where(solution.failed, number_of_result(solution.result), 0), axes)
+    failed = anywhere(solution.failed, axes)
+    return eqx.branched_error_if(solution, failed, number, messages_of_results())

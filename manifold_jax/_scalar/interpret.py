@@ -10,6 +10,7 @@ import numpy as np
 
 from . import control, structure
 from .arithmetic import ELEMENTWISE, elementwise
+from .example import example
 from .lanes import Lanes, NotScalarError
 from .value import Value
 
@@ -38,7 +39,7 @@ def call_in_lanes(lanes: Lanes, function: Callable, *args: Any) -> Any:
     """`function(*args)` in every lane. Leaves of `args` are [`Value`][]s, those of what is returned,
     too. What the function closes over is the same in every lane."""
     leaves, treedef = jtu.tree_flatten(args)
-    examples = jtu.tree_unflatten(treedef, [jax.ShapeDtypeStruct(v.shape, v.dtype) for v in leaves])
+    examples = jtu.tree_unflatten(treedef, [example(v.shape, v.dtype) for v in leaves])
     closed, shape = jax.make_jaxpr(function, return_shape=True)(*examples)
     out = evaluate(lanes, closed, leaves)
     return jtu.tree_unflatten(jtu.tree_structure(shape), out)

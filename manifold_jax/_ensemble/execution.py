@@ -1,0 +1,48 @@
+"""How an ensemble is solved: in lanes where that is possible, else mapped over."""
+
+import dataclasses
+
+import diffrax as dfx
+
+from .._adjoint import StepReplayAdjoint
+from .._directed_term import DirectedTerm
+from .._scalar import NotScalarError
+from .._solver.base import AbstractManifoldSolver
+from .._solver.explicit import is_unrollable
+from .in_lanes import solve_in_lanes, solve_in_lanes_forwards
+from .mapped import solve_mapped
+from .parts import Inputs
+from .solution import EnsembleSolution
+
+
+def solve_on_one_device(inputs: Inputs, lanes: int) -> EnsembleSolution:
+    obstacle = _obstacle(inputs)
+    if obstacle is None:
+        forwards = isinstance(inputs[0].adjoint, dfx.ForwardMode)
+        solve = solve_in_lanes_forwards if forwards else solve_in_lanes
+        try:
+            return solve(inputs, lanes)
+        except NotScalarError as error:
+            obstacle = str(error)
+    execution = f"mapped over, not in lanes: {obstacle}"
+    return dataclasses.replace(solve_mapped(inputs, lanes), execution=execution)
+
+
+def _obstacle(inputs: Inputs) -> str | None:
+    """What keeps trajectories out of lanes."""
+    equations, batch = inputs
+    one, saveat, solver = batch.one(), equations.saveat, equations.solver
+    if not isinstance(solver, AbstractManifoldSolver):
+        return f"`solver` is {type(solver).__name__} without a hook"
+    if not isinstance(equations.terms, dfx.ODETerm | DirectedTerm):
+        return f"`terms` are {type(equations.terms).__name__}, not an ODETerm"
+    if not is_unrollable(solver.inner, equations.terms, one.t0, one.t1, one.y0, one.args):
+        return f"{type(solver.inner).__name__} is not an explicit Runge-Kutta method"
+    if type(equations.controller) not in (dfx.PIDController, dfx.ConstantStepSize):
+        return f"`stepsize_controller` is {type(equations.controller).__name__}"
+    if not isinstance(equations.adjoint, StepReplayAdjoint | dfx.ForwardMode):
+        return f"`adjoint` is {type(equations.adjoint).__name__}"
+    others = saveat.solver_state or saveat.controller_state or saveat.made_jump
+    if not isinstance(saveat.subs, dfx.SubSaveAt) or others:
+        return "`saveat` asks for more than states"
+    return "`saveat` asks for steps" if saveat.dense or saveat.subs.steps else None
