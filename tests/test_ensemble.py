@@ -133,6 +133,19 @@ def test_a_saved_value_that_cannot_be_corrected():
     np.testing.assert_array_equal(np.isnan(sol.ys).any(axis=2), undefined)
 
 
+@pytest.mark.usefixtures("only_in_lanes")
+def test_undefined_starts_leave_the_others_untouched():
+    def solve(y):
+        options = dict(lanes=LANES, stepsize_controller=PID)
+        return mj.solve_ensemble(TURN, HOOKS["projected"], 0.0, 0.5, None, y, RATES, **options)
+
+    all, some = solve(STARTS), solve(STARTS.at[2, 0].set(jnp.nan).at[5].set(0.0))
+    assert [number for number, _ in some.failures()] == [2, 5]
+    defined = np.array([0, 1, 3, 4, 6])
+    np.testing.assert_array_equal(some.ys[defined], all.ys[defined])
+    assert not all.failures()
+
+
 def gradients(hook, saveat, t1s, loss):
     """Of `loss(ys)` with respect to what all have in common, and to what each has of its own: in lanes,
     and by trajectories alone; and forwards in lanes, along a random direction."""
