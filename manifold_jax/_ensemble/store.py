@@ -14,8 +14,8 @@ from .._compat import messages_of_results
 
 # Marks in `result` the trajectories that are not there yet.
 _MISSING = -1
-# Of files that were being written when the process was killed.
-_PARTIAL = "*.partial"
+# Files that were being written when the process was killed.
+_PARTIAL = re.compile(r"[^.]*\.[0-9a-f]{32}\.partial")
 
 
 def zarr() -> Any:
@@ -43,6 +43,7 @@ class StoredEnsemble:
         what they mean.
     - `settings`: what it was computed with.
     - `size`, `chunk`, `finished`: how many trajectories it has at its end, in one piece, and by now.
+    - `num_failed`: how many of those that are finished failed.
     """
 
     def __init__(self, group: Any):
@@ -86,6 +87,10 @@ class StoredEnsemble:
         if "result" not in self.group:
             return 0
         return min(self.size, self.chunk * int(self.result.nchunks_initialized))
+
+    @property
+    def num_failed(self) -> int:
+        return sum(int(np.count_nonzero(codes)) for _, codes in self._codes())
 
     def failures(self, most: int = 10) -> list[tuple[int, str]]:
         """Numbers and reasons of the first that failed, as of [`EnsembleSolution`][]."""
@@ -154,9 +159,14 @@ def created(path: Path, settings: dict[str, Any]) -> StoredEnsemble:
         return StoredEnsemble(zarr().create_group(path, attributes=attributes))
 
 
+def is_partial(file: Path) -> bool:
+    return _PARTIAL.fullmatch(file.name) is not None
+
+
 def clear_partial(path: Path) -> None:
-    for file in path.rglob(_PARTIAL):
-        file.unlink()
+    with clear_write_errors(path):
+        for file in filter(is_partial, list(path.rglob("*.partial"))):
+            file.unlink()
 
 
 def ensure_arrays(stored: StoredEnsemble, examples: Any) -> None:

@@ -19,13 +19,14 @@ from .._errors import clear_errors
 from .._solve.start import Consistent
 from .progress import Meter
 from .sampling import drawn
-from .settings import check_settings, described, environment, fingerprint
+from .settings import check_settings, settings_of
 from .solve_ensemble import solve_ensemble
 from .store import (
     clear_partial,
     clear_write_errors,
     created,
     ensure_arrays,
+    is_partial,
     named,
     stored_at,
     StoredEnsemble,
@@ -114,54 +115,48 @@ def stream_ensemble(
     chunk = min(_positive("chunk", chunk), size)
     key, out = _key(seed), Path(out)
     _check_functions(sample, t0, t1)
+    parts = {"sample": sample, "terms": terms, "solver": solver, "t0": t0, "t1": t1, "dt0": dt0}
     options = {
-        "dt0": dt0,
         "saveat": saveat,
         "stepsize_controller": stepsize_controller,
         "max_steps": max_steps,
         "lanes": lanes,
         "consistent": consistent,
     }
-    inputs = (sample, terms, solver, t0, t1, options)
-    lowered = _solve_chunk.lower(inputs, key, jnp.asarray(0), size, chunk)
-    settings = {"size": size, "chunk": chunk, "seed": int(seed)}
-    settings |= {"terms": described(terms), "solver": described(solver)}
-    settings |= {"t0": described(t0), "t1": described(t1)}
-    settings |= {name: described(value) for name, value in options.items()} | environment()
-    settings["program"] = fingerprint(lowered.as_text(), inputs)
-    examples = eqx.filter_eval_shape(_solve_chunk, inputs, key, jnp.asarray(0), size, chunk)
-    named(examples)
-    stored = _opened(out, settings, resume)
+    call = lambda start: (parts, options, key, jnp.asarray(start), size, chunk)
+    examples = eqx.filter_eval_shape(_solve_chunk, *call(0))
+    named(examples)  # refuses names before anything is written
+    lowered = _solve_chunk.lower(*call(0))
+    settings = {"size": size, "chunk": chunk, "seed": int(seed), **parts, **options}
+    stored = _opened(out, settings_of(settings, lowered.as_text()), resume)
     ensure_arrays(stored, examples)
-    finished = stored.finished
-    failed = sum(count for count, _ in stored.failures_by_reason().values())
+    finished, failed = stored.finished, stored.num_failed
     with Meter(size, finished, failed, progress) as meter:
         if finished < size:
             meter.compiling()
             program = lowered.compile()
             meter.begin()
         for start in range(finished, size, chunk):
-            values = program(inputs, key, jnp.asarray(start), size, chunk)
+            values = program(*call(start))
             write(stored, start, values)
             count = min(chunk, size - start)
-            meter.advance(count, np.count_nonzero(np.asarray(values["result"])[:count]))
+            meter.advance(count, int(np.count_nonzero(values["result"][:count])))
     return stored
 
 
 @eqx.filter_jit
-def _solve_chunk(inputs: Any, key: Array, start: Array, size: int, chunk: int) -> dict[str, Any]:
+def _solve_chunk(
+    parts: dict[str, Any], options: dict[str, Any], key: Array, start: Array, size: int, chunk: int
+) -> dict[str, Any]:
     """The same program for every chunk: the last trajectory fills the last one up."""
-    sample, terms, solver, t0, t1, options = inputs
-    options = dict(options)
-    dt0 = options.pop("dt0")
     index = jnp.minimum(start + jnp.arange(chunk), size - 1)
-    samples = drawn(sample, t0, t1, key, index)
+    samples = drawn(parts["sample"], parts["t0"], parts["t1"], key, index)
     solution = solve_ensemble(
-        terms,
-        solver,
+        parts["terms"],
+        parts["solver"],
         samples.t0,
         samples.t1,
-        dt0,
+        parts["dt0"],
         samples.y0s,
         samples.args,
         in_axes=samples.in_axes,
@@ -179,20 +174,23 @@ def _opened(out: Path, settings: dict[str, Any], resume: bool) -> StoredEnsemble
     """The folder, new or as it is, with those settings."""
     with clear_write_errors(out):
         out.mkdir(parents=True, exist_ok=True)
-        if resume:
-            clear_partial(out)
-    if any(out.iterdir()):
-        stored = stored_at(out, "r+") if resume else None
+        is_empty = all(resume and is_partial(file) for file in out.iterdir())
+    if is_empty:
+        stored = created(out, settings)
+    elif not resume:
+        raise FileExistsError(
+            errno.EEXIST,
+            f"`out={str(out)!r}` is not empty: take another folder, or `resume=True` to continue the ensemble there.",
+        )
+    else:
+        stored = stored_at(out, "r+")
         if stored is None:
-            advice = "`resume=True` continues an ensemble that is there" if not resume else ""
             raise FileExistsError(
-                errno.EEXIST,
-                f"`out={str(out)!r}` is not empty"
-                + (", and holds no ensemble" if resume else "; take another folder. " + advice),
+                errno.EEXIST, f"`out={str(out)!r}` is not empty, and holds no ensemble to continue."
             )
         check_settings(out, stored.settings, settings)
-        return stored
-    return created(out, settings)
+    clear_partial(out)
+    return stored
 
 
 def _positive(name: str, value: Any) -> int:
