@@ -54,4 +54,4 @@ class Meter:
 
     def _line(self, text: str) -> None:
         if self.in_lines:
-            self.console.print(text, soft_wrap=True, markup=False, highlight=False)
+            print(text, flush=True)
