@@ -323,10 +323,14 @@ def test_command(tmp_path):
     np.testing.assert_allclose(energy, start, rtol=0, atol=1e-13)
     again = run(*arguments, "--resume")
     assert "(100 were there)" in again.stdout
+    other = run(*arguments[:-1], "y0.0.1=normal(0,0.5)", "--resume")
+    assert other.exit_code == 2
+    assert "y0.0.1=normal(0.0, 0.001)" in unframed(other.output)
+    assert "y0.0.1=normal(0.0, 0.5)" in unframed(other.output)
 
 
 def test_command_reports_failures(tmp_path):
-    """Rods of negative length are as good as others, those of length zero are not."""
+    """Of starts so far away that their squares are infinite."""
     arguments = [*PENDULUM, "--vary", "args.gravity=uniform(9,10)", "--vary"]
     result = run(*arguments, "y0.0.0=normal(1e300,1e300)", "--out", tmp_path / "out")
     assert result.exit_code == 0, result.output

@@ -36,7 +36,7 @@ class Distribution(NamedTuple):
         return jnp.exp(jax.random.uniform(key, dtype=dtype, minval=a, maxval=b))
 
     def __str__(self) -> str:
-        return f"{self.target}={self.kind}({self.a:g}, {self.b:g})"
+        return f"{self.target}={self.kind}({self.a}, {self.b})"
 
 
 # Of each what its two numbers have to be.
@@ -94,6 +94,10 @@ class VariedProblem:
         self.problem, self.varied = problem, varied
         self.terms = dfx.ODETerm(lambda t, y, given: problem.terms.vf(t, y, given.args))
         self.constraint = ConstraintInArgs(problem.constraint, problem.constraint.redundant)
+
+    def __repr__(self) -> str:
+        """As the settings of the folder have it."""
+        return f"{self.problem.name} with {', '.join(map(str, self.varied))}"
 
     def sample(self, index: Array, key: Array) -> tuple[Any, Given]:
         del index
