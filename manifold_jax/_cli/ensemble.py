@@ -59,8 +59,8 @@ def ensemble(
 
     The folder is in the format Zarr (`manifold_jax.open_ensemble`, or `zarr.open_group`): end times
     `ts`, states `ys/y`, the constraint violation max |g| there `ys/violation`, what was drawn
-    `ys/varied`, statistics of the steps `stats` and result codes `result`. Needs
-    `pip install zarr`. A run that was interrupted, also by a killed process, goes on with the same
+    `ys/varied`, statistics of the steps `stats` and result codes `result`. Needs zarr
+    (`pip install zarr`). A run that was interrupted, also by a killed process, goes on with the same
     command and `--resume`, and ends with the same files.
     """
     task = task_for(problem, solver, rtol, atol, t1, None)
