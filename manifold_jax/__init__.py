@@ -22,7 +22,10 @@ from ._constraint import (
 )
 from ._ensemble import (
     EnsembleSolution as EnsembleSolution,
+    open_ensemble as open_ensemble,
     solve_ensemble as solve_ensemble,
+    StoredEnsemble as StoredEnsemble,
+    stream_ensemble as stream_ensemble,
 )
 from ._fit import fit as fit, FitResult as FitResult
 from ._mechanics import (

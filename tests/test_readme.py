@@ -14,7 +14,13 @@ README = Path(__file__).parents[1] / "README.md"
 BLOCKS = re.findall(r"```python\n(.*?)```", README.read_text(), flags=re.DOTALL)
 # What the others need of the first one, as the text says: the imports and the setting.
 PREAMBLE = BLOCKS[0].split("\n\n\n")[0]
-NAMES = ["fifteen lines", "mechanism", "curves and minima", "fit", "ensemble", "extend"]
+NAMES = ["fifteen lines", "mechanism", "curves and minima", "fit", "ensemble", "stream", "extend"]
+
+
+@pytest.fixture(autouse=True)
+def _elsewhere(tmp_path, monkeypatch):
+    """Examples may write files."""
+    monkeypatch.chdir(tmp_path)
 
 
 def run(*blocks):
@@ -59,6 +65,18 @@ def check_ensemble(namespace):
     assert np.abs(energy).max() < 1e-5
 
 
+def check_stream(namespace):
+    """Each has the energy of its own start."""
+    released = namespace["mj"].open_ensemble("released")
+    assert (released.finished, released.num_failed) == (2000, 0)
+    key = jax.vmap(lambda i: jax.random.fold_in(jax.random.key(0), i))(np.arange(100))
+    (start, _), _ = jax.vmap(namespace["release"])(np.arange(100), key)
+    q, v = namespace["positions"][:, 0], released.ys["1"][:100, 0]
+    energy = np.sum(v**2, axis=-1) / 2 + 9.81 * (q[:, 1] - start[:, 1])
+    assert np.abs(energy).max() < 1e-4
+    np.testing.assert_allclose(np.sum(q**2, axis=-1), 1, rtol=0, atol=1e-15)
+
+
 def check_extend(namespace):
     """It asserts by itself what the text says; by Newton's method the same."""
     cylinder = namespace["Cylinder"]()
@@ -75,6 +93,7 @@ CHECKS = (
     check_curves_and_minima,
     check_fit,
     check_ensemble,
+    check_stream,
     check_extend,
 )
 

@@ -1,1 +1,2 @@
 from .commands import app as app
+from .ensemble import ensemble as ensemble

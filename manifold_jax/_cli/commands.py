@@ -15,7 +15,7 @@ from .console import output_console, print_table, progress_bar
 app = typer.Typer(
     name="manifold-jax",
     help="Differential equations on manifolds: look at the gallery of problems, compare "
-    "solvers, reprint the paper's table. Computes in double precision.",
+    "solvers, solve one many times, reprint the paper's table. Computes in double precision.",
     no_args_is_help=True,
     add_completion=False,
     rich_markup_mode="markdown",  # which joins the lines of a paragraph

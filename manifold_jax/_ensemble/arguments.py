@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
+from jaxtyping import Array
 
 from .._constraint_checks import check_state
 from .._custom_types import Args, Y
@@ -64,7 +65,7 @@ def checked_step(dt0: Any, batch: Batch, axes: Axes) -> Any:
     """Refuse, while running, a first step that leads away from the end of some trajectory."""
     if dt0 is None:
         return None
-    t0, t1 = jax.vmap(lambda each: batch.complete(each)[:2])(batch.each)
+    t0, t1 = _ends(batch)
     dt0 = jnp.asarray(dt0, batch.dtype)
     message = "`dt0` must have the sign of t1 - t0 in all trajectories; None chooses it for each."
     return eqx.error_if(dt0, anywhere((t1 - t0) * dt0 < 0, axes), message)
@@ -77,7 +78,7 @@ def checked_times(saveat: dfx.SaveAt, batch: Batch, axes: Axes) -> dfx.SaveAt:
         if sub.ts is None:
             return sub
         ts = sub.ts.astype(batch.dtype)
-        t0, t1 = jax.vmap(lambda each: batch.complete(each)[:2])(batch.each)
+        t0, t1 = _ends(batch)
         direction = jnp.where(t0 < t1, 1, -1).astype(ts.dtype)[:, None]
         ahead = ts[None] * direction
         before, behind = t0[:, None] * direction, t1[:, None] * direction
@@ -92,6 +93,15 @@ def checked_times(saveat: dfx.SaveAt, batch: Batch, axes: Axes) -> dfx.SaveAt:
     is_sub = lambda x: isinstance(x, dfx.SubSaveAt)
     subs = jtu.tree_map(checked, saveat.subs, is_leaf=is_sub)
     return eqx.tree_at(lambda s: s.subs, saveat, subs, is_leaf=lambda x: x is None)
+
+
+def _ends(batch: Batch) -> tuple[Array, Array]:
+    """Of the time of each trajectory; where all have the same, of one: XLA takes seconds to compute
+    while compiling what thousands of equal constants amount to."""
+    t0, t1, *_ = batch.common
+    if t0 is not None and t1 is not None:
+        return jnp.asarray(t0, batch.dtype)[None], jnp.asarray(t1, batch.dtype)[None]
+    return jax.vmap(lambda each: batch.complete(each)[:2])(batch.each)
 
 
 def _leaves(tree: Any) -> list[tuple[Any, Any]]:

@@ -1,0 +1,57 @@
+"""How far a long run is: a bar on a terminal, lines in a file, a pipe or a notebook."""
+
+import time
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+
+class Meter:
+    """Silent unless `shown`. Lines are at least a second apart, and a tenth of the time gone by."""
+
+    def __init__(self, size: int, finished: int, failed: int, shown: bool):
+        self.console, self.size = Console(), size
+        self.finished, self.begun_at, self.failed = finished, finished, failed
+        self.in_lines = shown and not self.console.is_interactive
+        self.bar = Progress(
+            TextColumn("{task.description}"),
+            BarColumn(),
+            TextColumn("{task.completed:.0f} of {task.total:.0f}{task.fields[rate]}"),
+            TimeElapsedColumn(),
+            TimeRemainingColumn(),
+            console=self.console,
+            disable=not shown or self.in_lines,
+        )
+        self.task = self.bar.add_task("ensemble", total=size, completed=finished, rate="")
+        self.begun = self.last = time.perf_counter()
+
+    def __enter__(self) -> "Meter":
+        self.bar.start()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.bar.stop()
+
+    def compiling(self) -> None:
+        self.bar.update(self.task, description="ensemble: compiling", refresh=True)
+        self._line("ensemble: compiling")
+
+    def begin(self) -> None:
+        self.begun = self.last = time.perf_counter()
+        self.bar.update(self.task, description="ensemble", refresh=True)
+
+    def advance(self, count: int, failed: int) -> None:
+        self.finished += count
+        self.failed += failed
+        now = time.perf_counter()
+        rate = (self.finished - self.begun_at) / max(now - self.begun, 1e-9)
+        text = f", {rate:.0f}/s, {self.failed} failed"
+        self.bar.update(self.task, completed=self.finished, rate=text)
+        due = now - self.last >= max(1.0, 0.1 * (now - self.begun))
+        if due or self.finished == self.size:
+            self.last = now
+            self._line(f"ensemble: {self.finished} of {self.size}{text}")
+
+    def _line(self, text: str) -> None:
+        if self.in_lines:
+            print(text, flush=True)

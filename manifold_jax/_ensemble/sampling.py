@@ -1,0 +1,65 @@
+"""Trajectories made from their numbers, some of them at a time."""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jaxtyping import Array
+
+
+class Samples(eqx.Module):
+    """Arguments of `solve_ensemble`, for some of the trajectories."""
+
+    t0: Any
+    t1: Any
+    y0s: Any
+    args: Any
+    in_axes: Any = eqx.field(static=True)
+
+
+def drawn(sample: Callable, t0: Any, t1: Any, key: Array, index: Array) -> Samples:
+    """The trajectories numbered `index`. What of `args` depends neither on the number nor on the
+    key stays what all have in common."""
+    keys = jax.vmap(jax.random.fold_in, in_axes=(None, 0))(key, index)
+    own, common = _common(sample, index[0], keys[0])
+
+    def each(index: Array, key: Array) -> Any:
+        y0, args = _pair(sample(index, key))
+        y0 = jtu.tree_map(jnp.asarray, y0)
+        times = [t(index, key) if callable(t) else None for t in (t0, t1)]
+        return times, y0, eqx.filter(args, own)
+
+    (t0s, t1s), y0s, args = jax.vmap(each)(index, keys)
+    return Samples(
+        t0 if t0s is None else t0s,
+        t1 if t1s is None else t1s,
+        y0s,
+        eqx.combine(args, common),
+        jtu.tree_map(lambda own: 0 if own else None, own),
+    )
+
+
+def _common(sample: Callable, index: Array, key: Array) -> tuple[Any, Any]:
+    """Which leaves of `args` are computed, and the others, which do not depend on anything."""
+    args = None
+
+    def look(index: Array, key: Array) -> None:
+        nonlocal args
+        args = _pair(sample(index, key))[1]
+
+    jax.eval_shape(look, index, key)
+    own = jtu.tree_map(lambda leaf: isinstance(leaf, jax.core.Tracer), args)
+    return own, eqx.filter(args, own, inverse=True)
+
+
+def _pair(result: Any) -> tuple[Any, Any]:
+    if not isinstance(result, tuple) or len(result) != 2:
+        raise ValueError(
+            "`sample(index, key)` must return the pair `(y0, args)` of one trajectory, with `None` for `args` if "
+            f"there are none; got {type(result).__name__}"
+            f"{f' of length {len(result)}' if isinstance(result, tuple) else ''}."
+        )
+    return result
