@@ -3,7 +3,8 @@
  * The same method as `mj.Projected(dfx.Tsit5(), constraint)` with `dfx.PIDController(rtol, atol)`: links of
  * length 1, masses of its own for each pendulum, the accelerations from the 2 x 2 system for the tensions in
  * closed form; states corrected before the last stage, positions, then velocities, by two simplified Newton
- * iterations each with one factorization, along the inverse masses; the first step as in `_solve/first_step.py`.
+ * iterations each with one factorization, along the inverse masses; no error below the correction; the first step
+ * as in `_solve/first_step.py`.
  *
  *   gcc -O3 -march=native -shared -fPIC double_pendulum.c -lm             one pendulum after the other
  *   gcc -O3 -march=native -DLANES=8 -shared -fPIC double_pendulum.c -lm   eight, each with steps of its own,
@@ -102,20 +103,24 @@ static inline number level(const number x[SIZE], const number y[SIZE], const num
 /* One step of size h from y with derivative k[0]: the corrected state, and its error, squared. */
 static inline number step(const number y[SIZE], number h, number i1, number i2, double tolerance,
                           number k[STAGES][SIZE], number to[SIZE]) {
+  number raw[SIZE];
   for (int s = 1; s < STAGES; s++) {
     for (int i = 0; i < SIZE; i++) {
       number sum = A[s - 1][0] * k[0][i];
       for (int j = 1; j < s; j++) sum += A[s - 1][j] * k[j][i];
       to[i] = y[i] + h * sum;
     }
-    if (s == STAGES - 1) project(to, i1, i2);
+    if (s == STAGES - 1) {
+      for (int i = 0; i < SIZE; i++) raw[i] = to[i];
+      project(to, i1, i2);
+    }
     field(to, i1, i2, k[s]);
   }
   number error[SIZE];
   for (int i = 0; i < SIZE; i++) {
     number sum = ERROR[0] * k[0][i];
     for (int j = 1; j < STAGES; j++) sum += ERROR[j] * k[j][i];
-    error[i] = h * sum;
+    error[i] = larger(absolute(h * sum), absolute(to[i] - raw[i]));
   }
   return level(error, y, to, tolerance);
 }
