@@ -1,0 +1,65 @@
+"""Every benchmark runs: with the smallest settings, for what crashes, not for what it measures."""
+
+import importlib
+import json
+import os
+import sys
+from pathlib import Path
+
+import jax
+import pytest
+
+
+ROOT = Path(__file__).parents[1]
+sys.path.append(str(ROOT))
+
+MODULES = sorted(path.stem for path in (ROOT / "benchmarks").glob("[a-z_]*.py"))
+# Of others, and not needed for anything else.
+PEERS = ("casadi", "mujoco", "pydiffsol", "sksundae")
+SMALLEST = {
+    "approaches": dict(problems="pendulum", repeats=1, quick=True),
+    "closed_forms": dict(repeats=1),
+    "compile_time": dict(compilations=1, repeats=1, only="pendulum"),
+    "ensemble": dict(size=4, lanes=2, repeats=1, problems="pendulum", pendulums=4),
+    "gradients": dict(batch=2, repeats=3),
+    "mujoco_peers": dict(),
+    "neural": dict(systems="kepler", steps=10),
+    "overhead": dict(batch=2, repeats=1, compile_repeats=1),
+    "pendulum_peers": dict(repeats=1),
+    "thresholds": dict(repeats=3),
+}
+QUICK = ("ensemble",)
+
+
+def imported(name):
+    try:
+        return importlib.import_module(f"benchmarks.{name}")
+    except ModuleNotFoundError as error:
+        if error.name not in PEERS:
+            raise
+        pytest.skip(f"needs {error.name}")
+
+
+@pytest.fixture
+def as_before(monkeypatch):
+    """Benchmarks keep to one core and change settings of JAX."""
+    monkeypatch.setattr(os, "sched_setaffinity", lambda *args: None, raising=False)
+    cache = jax.config.jax_enable_compilation_cache
+    yield
+    jax.config.update("jax_enable_compilation_cache", cache)
+
+
+@pytest.mark.parametrize("name", MODULES)
+def test_imports(name):
+    imported(name)
+
+
+@pytest.mark.usefixtures("as_before")
+@pytest.mark.parametrize(
+    "name", [pytest.param(k, marks=[] if k in QUICK else pytest.mark.slow) for k in SMALLEST]
+)
+def test_runs(name, tmp_path, capsys):
+    file = tmp_path / "result.json"
+    imported(name).main(json=file, **SMALLEST[name])
+    assert capsys.readouterr().out.strip()
+    assert json.loads(file.read_text())["environment"]["versions"]["jax"] == jax.__version__
