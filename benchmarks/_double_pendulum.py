@@ -13,6 +13,7 @@ import diffrax as dfx
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
+from jax.sharding import Mesh
 from rich.table import Table
 
 import manifold_jax as mj
@@ -53,7 +54,7 @@ class Ends(NamedTuple):
 
 def measure(size: int, lanes: int, tolerance: float, repeats: int) -> list[Row]:
     given = pendulums(size)
-    runs = {"solve_ensemble": _ensemble(given, lanes, tolerance)}
+    runs = {"solve_ensemble": ensemble(given, lanes, tolerance)}
     runs |= _programs_by_hand(given, tolerance)
     timings = interleaved(runs, repeats)
     ends = {name: run() for name, run in runs.items()}
@@ -103,7 +104,9 @@ def pendulums(size: int) -> Pendulums:
     return Pendulums((q, np.zeros_like(q)), masses)
 
 
-def _ensemble(given: Pendulums, lanes: int, tolerance: float) -> Callable[[], Ends]:
+def ensemble(
+    given: Pendulums, lanes: int, tolerance: float, mesh: Mesh | None = None
+) -> Callable[[], Ends]:
     problem = mj.problems.double_pendulum(t1=T1)
     solver = mj.Projected(dfx.Tsit5(), problem.constraint)
     kind = type(problem.args)
@@ -121,6 +124,7 @@ def _ensemble(given: Pendulums, lanes: int, tolerance: float) -> Callable[[], En
             in_axes=kind(0, None, None),
             stepsize_controller=dfx.PIDController(rtol=tolerance, atol=tolerance),
             lanes=lanes,
+            mesh=mesh,
         )
         q, v = sol.ys
         return (q[:, -1], v[:, -1]), sol.stats["num_steps"]

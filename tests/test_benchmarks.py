@@ -1,5 +1,6 @@
 """Every benchmark runs: with the smallest settings, for what crashes, not for what it measures."""
 
+import contextlib
 import importlib
 import json
 import os
@@ -20,10 +21,11 @@ SMALLEST = {
     "approaches": dict(problems="pendulum", repeats=1, quick=True),
     "closed_forms": dict(repeats=1),
     "compile_time": dict(compilations=1, repeats=1, only="pendulum"),
+    "devices": dict(size=4, repeats=1),
     "ensemble": dict(size=4, lanes=2, repeats=1, problems="pendulum", pendulums=4),
     "gradients": dict(batch=2, repeats=3),
     "mujoco_peers": dict(),
-    "neural": dict(systems="kepler", steps=10),
+    "neural": dict(systems="two-body", steps=10),
     "overhead": dict(batch=2, repeats=1, compile_repeats=1),
     "pendulum_peers": dict(repeats=1),
     "thresholds": dict(repeats=3),
@@ -31,9 +33,10 @@ SMALLEST = {
 QUICK = ("ensemble",)
 
 
-def imported(name):
+@contextlib.contextmanager
+def without_peers():
     try:
-        return importlib.import_module(f"benchmarks.{name}")
+        yield
     except ModuleNotFoundError as error:
         if error.name not in PEERS:
             raise
@@ -43,6 +46,7 @@ def imported(name):
 @pytest.fixture
 def as_before(monkeypatch):
     """Benchmarks keep to one core and change settings of JAX."""
+    monkeypatch.setenv("XLA_FLAGS", os.environ.get("XLA_FLAGS", ""))
     monkeypatch.setattr(os, "sched_setaffinity", lambda *args: None, raising=False)
     cache = jax.config.jax_enable_compilation_cache
     yield
@@ -51,7 +55,8 @@ def as_before(monkeypatch):
 
 @pytest.mark.parametrize("name", MODULES)
 def test_imports(name):
-    imported(name)
+    with without_peers():
+        importlib.import_module(f"benchmarks.{name}")
 
 
 @pytest.mark.usefixtures("as_before")
@@ -60,6 +65,7 @@ def test_imports(name):
 )
 def test_runs(name, tmp_path, capsys):
     file = tmp_path / "result.json"
-    imported(name).main(json=file, **SMALLEST[name])
+    with without_peers():
+        importlib.import_module(f"benchmarks.{name}").main(json=file, **SMALLEST[name])
     assert capsys.readouterr().out.strip()
     assert json.loads(file.read_text())["environment"]["versions"]["jax"] == jax.__version__
