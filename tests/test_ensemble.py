@@ -214,6 +214,8 @@ def test_bad_arguments():
     with pytest.raises(ValueError, match="`mesh` has no devices"):
         solve(mesh=Mesh(np.array([]), "x"))
     implicit, mesh = mj.Projected(dfx.Kvaerno3(), CIRCLE), Mesh(jax.devices()[:1], "x")
+    with jax.set_mesh(mesh), pytest.raises(ValueError, match="`mesh` cannot be used inside"):
+        solve(mesh=mesh)
     with pytest.raises(ValueError, match="`mesh` is for explicit solvers"):
         mj.solve_ensemble(TURN, implicit, 0.0, 1.0, 0.1, STARTS, RATES, mesh=mesh)
     with pytest.raises(TypeError, match="`y0s`"):
