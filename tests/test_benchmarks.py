@@ -17,13 +17,13 @@ sys.path.append(str(ROOT))
 MODULES = sorted(path.stem for path in (ROOT / "benchmarks").glob("[a-z_]*.py"))
 # Of others, and not needed for anything else.
 PEERS = ("casadi", "mujoco", "pydiffsol", "sksundae")
+# Without `gradients`, which compiles for minutes, and `fuzz`, which has tests of its own.
 SMALLEST = {
     "approaches": dict(problems="pendulum", repeats=1, quick=True),
     "closed_forms": dict(repeats=1),
     "compile_time": dict(compilations=1, repeats=1, only="pendulum"),
     "devices": dict(size=4, repeats=1),
     "ensemble": dict(size=4, lanes=2, repeats=1, problems="pendulum", pendulums=4),
-    "gradients": dict(batch=2, repeats=3),
     "mujoco_peers": dict(),
     "neural": dict(systems="two-body", steps=10),
     "overhead": dict(batch=2, repeats=1, compile_repeats=1),
@@ -45,12 +45,20 @@ def without_peers():
 
 @pytest.fixture
 def as_before(monkeypatch):
-    """Benchmarks keep to one core and change settings of JAX."""
+    """Benchmarks keep to one core, change settings of JAX, and are written for the usual ones."""
     monkeypatch.setenv("XLA_FLAGS", os.environ.get("XLA_FLAGS", ""))
     monkeypatch.setattr(os, "sched_setaffinity", lambda *args: None, raising=False)
-    cache = jax.config.jax_enable_compilation_cache
+    usual = {
+        "jax_numpy_dtype_promotion": "standard",
+        "jax_numpy_rank_promotion": "allow",
+        "jax_enable_compilation_cache": False,
+    }
+    before = {name: getattr(jax.config, name) for name in usual}
+    for name, value in usual.items():
+        jax.config.update(name, value)
     yield
-    jax.config.update("jax_enable_compilation_cache", cache)
+    for name, value in before.items():
+        jax.config.update(name, value)
 
 
 @pytest.mark.parametrize("name", MODULES)
