@@ -17,7 +17,8 @@ sys.path.append(str(ROOT))
 MODULES = sorted(path.stem for path in (ROOT / "benchmarks").glob("[a-z_]*.py"))
 # Of others, and not needed for anything else.
 PEERS = ("casadi", "mujoco", "pydiffsol", "sksundae")
-# Without `gradients`, which compiles for minutes, and `fuzz`, which has tests of its own.
+# Without those that compile or train for a minute and more (`gradients`, `neural`, `overhead`, `thresholds`) and
+# `fuzz`, which has tests of its own.
 SMALLEST = {
     "approaches": dict(problems="pendulum", repeats=1, quick=True),
     "closed_forms": dict(repeats=1),
@@ -25,10 +26,7 @@ SMALLEST = {
     "devices": dict(size=4, repeats=1),
     "ensemble": dict(size=4, lanes=2, repeats=1, problems="pendulum", pendulums=4),
     "mujoco_peers": dict(),
-    "neural": dict(systems="two-body", steps=10),
-    "overhead": dict(batch=2, repeats=1, compile_repeats=1),
     "pendulum_peers": dict(repeats=1),
-    "thresholds": dict(repeats=3),
 }
 QUICK = ("ensemble",)
 
