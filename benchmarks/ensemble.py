@@ -1,11 +1,12 @@
 """Many trajectories: `mj.solve_ensemble` next to `jax.vmap` and `jax.lax.map` of `mj.diffeqsolve`, and
-to SciPy.
+to SciPy; double pendulums next to C; and a batch in which a few trajectories take much longer.
 
 `python -m benchmarks.ensemble --json benchmarks/results/ensemble.json`
 
 Projected Tsit5, rtol = atol = 1e-6, the states at the end, from disturbed initial values that are made
 consistent; microseconds per step and trajectory on one core. `vmap` gets fewer trajectories, as its time
-grows with them; SciPy (DOP853, no constraint) gets three.
+grows with them; SciPy (DOP853, no constraint) gets three. `double_pendulum.c` takes the same steps, with gcc
+where there is one.
 """
 
 import dataclasses
@@ -27,6 +28,7 @@ from scipy.integrate import solve_ivp
 import manifold_jax as mj
 from manifold_jax.problems import Problem
 
+from . import _double_pendulum as by_hand, _heavy_tail as heavy_tail
 from ._measure import (
     compiled,
     CompileTime,
@@ -205,8 +207,9 @@ def main(
     lanes: Annotated[int, typer.Option(min=1, help="That advance together.")] = 128,
     repeats: Annotated[int, typer.Option(min=1, help="Timed runs of each program.")] = 3,
     problems: Annotated[str, typer.Option(metavar="NAME,...")] = ",".join(PROBLEMS),
+    pendulums: Annotated[int, typer.Option(min=1, help="Next to C.")] = 20_000,
 ) -> None:
-    """Measure ensembles next to `vmap`, `lax.map` and SciPy."""
+    """Measure ensembles next to `vmap`, `lax.map`, SciPy and C."""
     use_one_core()
     use_double_precision()
     console = make_console()
@@ -214,11 +217,19 @@ def main(
         rows = []
         for name in problems.split(","):
             rows += measure(getattr(mj.problems, name)(), size, lanes, repeats)
-    console.print(table_of(rows))
+        pendulum_rows = by_hand.measure(pendulums, lanes, TOLERANCE, repeats)
+        tail = heavy_tail.measure(size, lanes, TOLERANCE, repeats)
+    console.print(table_of(rows), by_hand.table_of(pendulum_rows))
+    console.print(
+        f"1 of {heavy_tail.ONE_IN} orbits takes up to {tail.most_steps} steps, the mean is {tail.steps:.0f}: "
+        f"{tail.ratio:.2f} times the sum of what each would take in full lanes"
+    )
     if json is not None:
         settings = {"rtol": TOLERANCE, "lanes": lanes, "disturbance": DISTURBANCE}
         content = {"environment": environment(), "settings": settings}
-        write_json(json, {**content, "rows": [dataclasses.asdict(row) for row in rows]})
+        content["rows"] = [dataclasses.asdict(row) for row in rows]
+        content["double_pendulums"] = [dataclasses.asdict(row) for row in pendulum_rows]
+        write_json(json, content | {"heavy_tail": dataclasses.asdict(tail)})
 
 
 if __name__ == "__main__":

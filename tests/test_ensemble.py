@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.sharding import Mesh
 
 import manifold_jax as mj
 
@@ -113,6 +114,26 @@ def test_a_failure_leaves_the_others_as_they_are():
             max_steps=9,
             throw=True,
         )
+
+
+@pytest.mark.usefixtures("only_in_lanes")
+@pytest.mark.parametrize("bad", [jnp.nan, 0.0], ids=["not a number", "singular"])
+def test_one_of_a_thousand(bad, thousand):
+    starts = np.resize(STARTS, (1000, 2))
+    good, one_bad = (
+        thousand(starts),
+        thousand(np.where(np.arange(1000)[:, None] == 500, bad, starts)),
+    )
+    assert [number for number, _ in one_bad.failures()] == [500]
+    others = np.arange(1000) != 500
+    np.testing.assert_array_equal(one_bad.ys[others], good.ys[others])
+
+
+@pytest.fixture(scope="module")
+def thousand():
+    options = dict(in_axes=None, stepsize_controller=PID)
+    hook, rate = HOOKS["projected"], jnp.asarray(2.0)
+    return jax.jit(lambda y: mj.solve_ensemble(TURN, hook, 0.0, 1.0, None, y, rate, **options))
 
 
 @pytest.mark.usefixtures("only_in_lanes")
@@ -288,6 +309,15 @@ def test_bad_arguments():
         solve(in_axes=1)
     with pytest.raises(ValueError, match="`max_steps` must be"):
         solve(max_steps=None)
+    with pytest.raises(TypeError, match="`mesh` must be None or a `jax.sharding.Mesh`.*got int"):
+        solve(mesh=2)
+    with pytest.raises(ValueError, match="`mesh` has no devices"):
+        solve(mesh=Mesh(np.array([]), "x"))
+    implicit, mesh = mj.Projected(dfx.Kvaerno3(), CIRCLE), Mesh(jax.devices()[:1], "x")
+    with jax.set_mesh(mesh), pytest.raises(ValueError, match="`mesh` cannot be used inside"):
+        solve(mesh=mesh)
+    with pytest.raises(ValueError, match="`mesh` is for explicit solvers"):
+        mj.solve_ensemble(TURN, implicit, 0.0, 1.0, 0.1, STARTS, RATES, mesh=mesh)
     with pytest.raises(TypeError, match="`y0s`"):
         solve(y=jnp.ones((7, 2), int))
     with pytest.raises(RuntimeError, match="`dt0` must have the sign"):

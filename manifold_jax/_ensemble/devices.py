@@ -25,6 +25,11 @@ def check_mesh(mesh: Any, solver: dfx.AbstractSolver) -> None:
         )
     if mesh.size == 0:
         raise ValueError("`mesh` has no devices. `mesh=None` solves on one device.")
+    if not jax.sharding.get_abstract_mesh().empty:
+        raise ValueError(
+            "`mesh` cannot be used inside `jax.set_mesh` or `jax.shard_map`. Call `mj.solve_ensemble` outside, its "
+            "`mesh` is enough."
+        )
     # https://github.com/patrick-kidger/lineax/issues/185
     if isinstance(solver, dfx.AbstractImplicitSolver):
         raise ValueError(

@@ -4,6 +4,7 @@ from typing import Any
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 from diffrax import RESULTS
 from jaxtyping import Array, PyTree
@@ -35,7 +36,7 @@ class EnsembleSolution(eqx.Module):
     def failures(self, most: int = 10) -> list[tuple[int, str]]:
         """Numbers and reasons of the first that failed; not under `jit`. Of several processes each
         lists those of its own devices."""
-        codes, messages = number_of_result(self.result), messages_of_results()
+        codes, messages = jnp.asarray(number_of_result(self.result)), messages_of_results()
         successful, failed = number_of_result(RESULTS.successful), {}
         for shard in codes.addressable_shards:
             part = np.asarray(shard.data)

@@ -62,9 +62,15 @@ def solve_ensemble(
     - `args`, `in_axes`: what of `args` each trajectory has of its own, as in `jax.vmap`: 0 for a
         leading axis, `None` for what is common to all; a prefix of the tree of `args`.
     - `saveat`: the end, `SaveAt(t1=True)`, the start, times (common to all), and functions of them.
-    - `lanes`: how many trajectories advance together.
+    - `lanes`: how many trajectories advance together, on each device.
     - `adjoint`: the mode of differentiation: reverse, or `diffrax.ForwardMode()` for `jax.jvp` and
         `jax.jacfwd`. Both make the steps again that the solve made.
+    - `mesh`: a `jax.sharding.Mesh`, e.g. `jax.make_mesh((jax.device_count(),), ("trajectories",))`: each of
+        its devices, over all of its axes, solves an equal share of the trajectories in lanes of its
+        own. What is returned is sharded along the trajectories if their number divides among the devices, and
+        whole on each of them if not. Nothing is sent between devices until they are done, and for gradients
+        with respect to what is common to all one sum. Of several processes (`jax.distributed`) each passes the
+        same arguments. For explicit solvers. By default one device solves all.
     - `throw`: raise a `RuntimeError` if any trajectory fails. By default it has a result code, and
         the others are what they are without it.
 
@@ -80,7 +86,8 @@ def solve_ensemble(
 
     **Raises:**
 
-    As `diffeqsolve`, and `ValueError` for leading axes that disagree.
+    As `diffeqsolve`, `ValueError` for leading axes that disagree, and for a `mesh` without devices or
+    with an implicit solver, and `TypeError` for a `mesh` that is none.
     """
     if mesh is not None:
         check_mesh(mesh, solver)
