@@ -34,7 +34,7 @@ class Compressed(NamedTuple):
         colors = _colors(needed.T @ met > 0)
         seeds = np.zeros((int(colors.max(initial=-1)) + 1, levels, len(aliases.root)))
         compact = np.searchsorted(aliases.roots, aliases.root)
-        for (order, column), color in zip(pairs, colors):
+        for (order, column), color in zip(pairs, colors, strict=True):
             for unknown in np.nonzero(compact == column)[0]:
                 level = order - aliases.shift[unknown]
                 if 0 <= level < levels:

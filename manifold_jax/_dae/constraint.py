@@ -1,5 +1,6 @@
 """The manifold of a reduced system."""
 
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -11,6 +12,7 @@ from jaxtyping import Array, Float
 
 from .._constraint import AbstractConstraint
 from .._custom_types import Args, BoolScalar, RealScalarLike, Y
+from .._newton import implicit_root
 from .._residual import as_time
 from .closing import Closing, Static
 from .derivatives import total_derivatives
@@ -66,34 +68,29 @@ def hidden_constraints(
     return jnp.concatenate(parts)
 
 
-def leading_derivatives(system: Reduced, t: Any, z: Array, args: Args) -> Float[Array, " n"]:
-    return system.closing(t, z, args).solve()
-
-
 def rate(system: Reduced, t: Any, z: Array, args: Args) -> Float[Array, " a"]:
     """The vector field."""
-    return system.static.plan.layout.rate()(z, leading_derivatives(system, t, z, args))
+    return system.static.plan.layout.rate()(z, system.closing(t, z, args).solve())
 
 
 def unknowns_with_derivatives(
     system: Reduced, t: Any, z: Array, args: Args, number: int
 ) -> list[Float[Array, " n"]]:
-    """`x, x', ...` up to that derivative; those that are not in the equations by differentiating
-    along the solution."""
-    t = as_time(t, z.dtype)
+    """`x, x', ...` up to that derivative, by differentiating along the solution."""
+    layout = system.static.plan.layout
+    w = system.closing(t, z, args).solve()
 
-    def x(t: Array, z: Array) -> Array:
-        return system.static.plan.layout.jet(0)(z, leading_derivatives(system, t, z, args))
+    def leading(t: Array, z: Array) -> Array:
+        """Solved for only once: nearby, the same as the function that the equations define."""
+        return implicit_root(system.closing(t, z, args), w)
 
-    found, functions = [], x
-    for _ in range(number):
-        found.append(functions(t, z))
-        functions = _along_solution(system, functions, args)
-    return [*found, functions(t, z)]
+    def differentiated(function: Callable) -> Callable:
+        return lambda t, z: jax.jvp(
+            function, (t, z), (jnp.ones_like(t), layout.rate()(z, leading(t, z)))
+        )[1]
 
-
-def _along_solution(system: Reduced, function: Any, args: Args) -> Any:
-    def derivative(t: Array, z: Array) -> Array:
-        return jax.jvp(function, (t, z), (jnp.ones_like(t), rate(system, t, z, args)))[1]
-
-    return derivative
+    t, function, found = as_time(t, z.dtype), lambda t, z: layout.jet(0)(z, leading(t, z)), []
+    for _ in range(number + 1):
+        found.append(function(t, z))
+        function = differentiated(function)
+    return found

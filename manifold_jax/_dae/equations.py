@@ -1,5 +1,6 @@
 """The equations `F(t, x, x', ..., args) = 0` as a function of vectors."""
 
+import itertools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -31,10 +32,10 @@ class Equations(eqx.Module):
 
     def unravel(self, x: Float[Array, " n"]) -> Any:
         leaves, structure = self.shapes
-        sizes = np.cumsum([0, *(int(np.prod(leaf.shape)) for leaf in leaves)])
+        sizes = [int(np.prod(leaf.shape)) for leaf in leaves]
         parts = [
-            x[a:b].reshape(leaf.shape).astype(jnp.promote_types(leaf.dtype, x.dtype))
-            for a, b, leaf in zip(sizes, sizes[1:], leaves)
+            x[end - size : end].reshape(leaf.shape).astype(jnp.promote_types(leaf.dtype, x.dtype))
+            for size, end, leaf in zip(sizes, itertools.accumulate(sizes), leaves, strict=True)
         ]
         return jtu.tree_unflatten(structure, parts)
 

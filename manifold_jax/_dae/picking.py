@@ -1,5 +1,7 @@
 """Numbers of a vector in another order."""
 
+import itertools
+
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -21,6 +23,6 @@ def pick(source: Float[Array, " a"], index: np.ndarray) -> Float[Array, " n"]:
         return jnp.concatenate([source, jnp.zeros((1,), source.dtype)])[index]
     parts = [
         source[index[a] : index[a] + b - a] if index[a] >= 0 else jnp.zeros(b - a, source.dtype)
-        for a, b in zip(starts[:-1], starts[1:])
+        for a, b in itertools.pairwise(starts)
     ]
     return parts[0] if len(parts) == 1 else jnp.concatenate(parts)

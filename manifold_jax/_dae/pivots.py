@@ -50,11 +50,12 @@ def _independent_pivots(
     there = np.any([J != 0 for J in samples], axis=0)
     good = constant & (size > _SMALLEST_PIVOT)
     rows, columns = [], []
-    for i, j in sorted(zip(*np.nonzero(good)), key=lambda ij: there[ij[0]].sum()):
+    for i, j in sorted(np.argwhere(good).tolist(), key=lambda ij: there[ij[0]].sum()):
         if not there[i, columns].any() and not there[rows, j].any():
             rows.append(i)
             columns.append(j)
-    return np.array(rows, int), np.array(columns, int)
+    order = np.argsort(np.array(columns, int))
+    return np.array(rows, int)[order], np.array(columns, int)[order]
 
 
 def _schur_complement(J: np.ndarray, r: Any, c: Any, other_r: Any, other_c: Any) -> np.ndarray:

@@ -122,8 +122,10 @@ class DAEReport:
         ]
 
     def _grouped(self) -> str:
-        groups = [(c, [e for e, k in zip(self.equations, self.c) if k == c]) for c in set(self.c)]
-        return "; ".join(f"{c} times {_listed(names)}" for c, names in sorted(groups))
+        groups: dict[int, list[str]] = {}
+        for name, c in zip(self.equations, self.c.tolist(), strict=True):
+            groups.setdefault(c, []).append(name)
+        return "; ".join(f"{c} times {_listed(groups[c])}" for c in sorted(groups))
 
 
 def _listed(names: tuple[str, ...] | list[str]) -> str:
