@@ -345,3 +345,55 @@ def crane_flat(t, a):
     u2 = lambda t: a["J"] * d(d(R))(t) + a["rho"] ** 2 * tension(t)
     every = [X, Z, D, R, d(X), d(Z), d(D), d(R), angle, tension, u1, u2]
     return jnp.stack([f(t) for f in every])
+
+
+# Published benchmarks of index 3, as residuals.
+
+
+def car_axis(t, x, xdot, a):
+    """The car axis of the IVP test set; its multipliers have the other sign there.
+
+    `x = {"q": (4,), "v": (4,), "force": (2,)}`.
+    """
+    q, v, force = x["q"], x["v"], x["force"]
+    k = a.mass * a.epsilon**2 / 2
+    yb = a.road_amplitude * jnp.sin(a.road_frequency * t)
+    xb = jnp.sqrt(a.length**2 - yb**2)
+    xl, yl, xr, yr = q[0], q[1], q[2], q[3]
+    left, right = jnp.hypot(xl, yl), jnp.hypot(xr - xb, yr - yb)
+    springs = [
+        (a.spring_length - left) * xl / left,
+        (a.spring_length - left) * yl / left - k * a.gravity,
+        (a.spring_length - right) * (xr - xb) / right,
+        (a.spring_length - right) * (yr - yb) / right - k * a.gravity,
+    ]
+    reaction = [
+        xb * force[0] + 2 * (xl - xr) * force[1],
+        yb * force[0] + 2 * (yl - yr) * force[1],
+        -2 * (xl - xr) * force[1],
+        -2 * (yl - yr) * force[1],
+    ]
+    return {
+        "kinematics": xdot["q"] - v,
+        "motion": k * xdot["v"] - jnp.stack(springs) + jnp.stack(reaction),
+        "joints": jnp.stack([xl * xb + yl * yb, (xl - xr) ** 2 + (yl - yr) ** 2 - a.length**2]),
+    }
+
+
+# Multipliers at t = 3, with the sign above. Source: Test Set for IVP Solvers, caraxis.
+CAR_AXIS_FORCE = (0.473688659084893324729e-2, 0.110468033125734368808e-2)
+
+
+def mechanism(mass, loops, force):
+    """The residual of a mechanism of the benchmarks, by its parts."""
+
+    def residual(t, x, xdot, a):
+        q, v = x["q"], x["v"]
+        _, pull = jax.vjp(lambda q: loops(t, q, a), q)
+        return {
+            "kinematics": xdot["q"] - v,
+            "motion": mass(q, a) @ xdot["v"] - force(t, q, v, a) + pull(x["force"])[0],
+            "loops": loops(t, q, a),
+        }
+
+    return residual
