@@ -15,6 +15,7 @@ from .equations import Equations
 from .layout import Layout
 from .picking import pick
 from .pivots import Eliminated, Elimination
+from .signature import Structure
 
 
 class Plan(NamedTuple):
@@ -24,6 +25,7 @@ class Plan(NamedTuple):
     entries: Compressed
     elimination: Elimination
     order: int
+    unlifted: Structure  # with the fewest differentiations
 
     def jets(
         self, z: Float[Array, " a"], w: Float[Array, " n"] | None, differentiations: int

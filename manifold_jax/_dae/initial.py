@@ -123,14 +123,13 @@ class Levels:
 
 def consistent_state(
     system: Reduced,
-    unlifted: Structure,
     t0: RealScalarLike,
     guess: Guess,
     args: Args,
     throw: bool,
 ) -> tuple[Array, ProjectionInfo]:
     z, t = guess.z, as_time(t0, guess.z.dtype)
-    layout = system.static.plan.layout
+    layout, unlifted = system.static.plan.layout, system.static.plan.unlifted
     j = np.searchsorted(layout.aliases.roots, layout.aliases.root[layout.names[:, 1]])
     level = layout.names[:, 0] + layout.aliases.shift[layout.names[:, 1]]
     levels = Levels(unlifted.c, layout.structure.c, np.nonzero(level >= unlifted.d[j])[0])

@@ -106,8 +106,8 @@ def reduce_dae(
         raise ValueError(_singular(equations, aliases, samples, report))
     constant = structure.leading & ~_at(aliases.merged(occurrence.varies), structure.sigma)
     elimination = Elimination.of(constant, samples.matrices)
-    plan = Plan(layout, entries, elimination, order)
-    return ReducedDAE(Reduced(equations, Static(plan)), report, Static(unlifted))
+    plan = Plan(layout, entries, elimination, order, unlifted)
+    return ReducedDAE(Reduced(equations, Static(plan)), report)
 
 
 def _check_concrete(x: Any, args: Any) -> None:

@@ -56,7 +56,7 @@ def known_value(equation: Any, values: list[Value]) -> list[np.ndarray] | None:
     name = equation.primitive.name
     try:
         if name in _FOLDED_WITH_NUMPY:
-            return [_FOLDED_WITH_NUMPY[name](*operands)]
+            return [np.asarray(_FOLDED_WITH_NUMPY[name](*operands))]
         if name in MOVES and name != "gather":
             return move(equation, operands)
         return bind(equation, operands, equation.params)
@@ -131,7 +131,7 @@ def _moved(equation: Any, values: list[Value]) -> list[Value] | None:
         shape = value.depends.shape[:-1]
         size = int(np.prod(shape))
         operands[i] = np.arange(start, start + size, dtype=np.int32).reshape(shape)
-        rows.append(value.depends.reshape(size, -1))
+        rows.append(value.depends.reshape(size, value.depends.shape[-1]))
         start += size
     nowhere = np.arange(rows[0].shape[1]) == rows[0].shape[1] - 1  # some constant
     table = np.concatenate([*rows, nowhere[None]])

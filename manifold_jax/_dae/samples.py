@@ -33,7 +33,9 @@ class Samples(NamedTuple):
     @staticmethod
     def of(equations: Equations, layout: Layout, entries: Compressed, point: Point) -> "Samples":
         nothing = np.zeros(0, int)
-        plan = Plan(layout, entries, Elimination(*[nothing] * 4, 0), equations.order)
+        plan = Plan(
+            layout, entries, Elimination(*[nothing] * 4, 0), equations.order, layout.structure
+        )
         static = Static(plan)
 
         @jax.jit

@@ -10,7 +10,6 @@ from jaxtyping import Array, Float
 from .._constraint_checks import check_state
 from .._custom_types import Args, RealScalarLike, Y
 from .._projection_info import ProjectionInfo
-from .closing import Static
 from .constraint import rate, Reduced, ReducedConstraint, unknowns_with_derivatives
 from .initial import consistent_state, Guess
 from .report import DAEReport
@@ -22,7 +21,6 @@ class ReducedDAE(eqx.Module):
 
     system: Reduced
     report: DAEReport = eqx.field(static=True)
-    unlifted: Static = eqx.field(static=True)
 
     @property
     def terms(self) -> dfx.ODETerm:
@@ -76,7 +74,7 @@ class ReducedDAE(eqx.Module):
         (redundant equations, singular configurations; outside of `jit` it says which).
         """
         guess = Guess.of(self.system, x_guess, derivatives, fixed)
-        return consistent_state(self.system, self.unlifted.plan, t0, guess, args, throw)
+        return consistent_state(self.system, t0, guess, args, throw)
 
     def outputs(self, t: RealScalarLike, z: Float[Array, " states"], args: Args = None) -> Any:
         """All unknowns and their derivatives, `(x, x', ...)`, as many as `F` takes, multipliers and
