@@ -184,6 +184,7 @@ def test_no_freedom_is_left_to_a_crane():
     np.testing.assert_allclose(xdot, expected[1], rtol=0, atol=1e-10)
 
 
+@pytest.mark.slow
 def test_servo():
     """A path for the tip, and the torques that follow from it."""
     args = models.ARM_ARGS
@@ -521,7 +522,7 @@ def test_report_of_many():
     report = mj.reduce_dae(models.chain, x, args).report
     text = str(report)
     assert "2 times rods[0], rods[1]" in text
-    assert max(map(len, text.splitlines())) < 500
+    assert max(map(len, text.splitlines())) < 700
     assert "taken to depend" not in text
 
 

@@ -41,13 +41,11 @@ class ReducedConstraint(AbstractConstraint):
     of the state alone. Lower derivatives first. Built by `reduce_dae`."""
 
     system: Reduced
-    differentiations: "tuple[int, ...] | None" = eqx.field(static=True, default=None)  # if not all
     redundant: bool = eqx.field(static=True, default=False)
 
     def __call__(self, t: RealScalarLike, y: Y, args: Args = None) -> Float[Array, " m"]:
-        c = self.differentiations
-        c = self.system.static.plan.layout.structure.c if c is None else c
-        return hidden_constraints(self.system, t, y, args, np.zeros(len(c), int), np.asarray(c))
+        c = self.system.static.plan.layout.structure.c
+        return hidden_constraints(self.system, t, y, args, np.zeros_like(c), c)
 
     def faults(self, t, y, args=None) -> tuple[tuple[BoolScalar, str], ...]:
         closing = self.system.closing(t, jfu.ravel_pytree(y)[0], args)

@@ -1,6 +1,5 @@
 """Consistent initial values."""
 
-import dataclasses
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -12,18 +11,17 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._custom_types import Args, BoolScalar, RealScalarLike, Y
-from .._newton import AbstractEquations, find_root, implicit_root, without_derivative
+from .._errors import clear_errors
+from .._linear import gram
+from .._newton import without_derivative
 from .._projection import NewtonProjection
 from .._projection_info import ProjectionInfo
 from .._residual import as_time, jacobian, row_scale
-from .constraint import hidden_constraints, Reduced, ReducedConstraint
+from .constraint import Reduced, ReducedConstraint
 from .names import leaf_names, listed
+from .nearest import nearest_state, with_lifted
 from .pivots import Pivoted
 from .samples import condition, dependent_rows, singular_below
-from .signature import Structure
-
-
-_MAX_STEPS = 50
 
 
 class Guess(NamedTuple):
@@ -90,90 +88,55 @@ def _fixed(system: Reduced, x: Y, fixed: Any) -> np.ndarray:
     return held
 
 
-class _Lifted(AbstractEquations):
-    """The equations for the unknowns that became states, `z[where]`, with the others given."""
-
-    system: Reduced
-    t: Array
-    z: Float[Array, " states"]
-    args: Args
-    levels: "Levels" = eqx.field(static=True)
-
-    def point(self, z: Float[Array, " lifted"]) -> Float[Array, " states"]:
-        return self.z.at[self.levels.states].set(z)
-
-    def residual(self, x: Float[Array, " states"]) -> Float[Array, " lifted"]:
-        return hidden_constraints(
-            self.system, self.t, x, self.args, self.levels.first, self.levels.end
-        )
-
-    def linearize(self, x: Float[Array, " states"]) -> Pivoted:
-        along = lambda u: self.residual(x.at[self.levels.states].set(u))
-        return Pivoted.of(jax.jacfwd(along)(x[self.levels.states]))
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class Levels:
-    """Which derivatives of which equations, and which states."""
-
-    first: np.ndarray
-    end: np.ndarray
-    states: np.ndarray
-
-
 def consistent_state(
-    system: Reduced,
-    t0: RealScalarLike,
-    guess: Guess,
-    args: Args,
-    throw: bool,
+    system: Reduced, t0: RealScalarLike, guess: Guess, args: Args, throw: bool
 ) -> tuple[Array, ProjectionInfo]:
-    z, t = guess.z, as_time(t0, guess.z.dtype)
-    layout, unlifted = system.static.plan.layout, system.static.plan.unlifted
-    j = np.searchsorted(layout.aliases.roots, layout.aliases.root[layout.names[:, 1]])
-    level = layout.names[:, 0] + layout.aliases.shift[layout.names[:, 1]]
-    levels = Levels(unlifted.c, layout.structure.c, np.nonzero(level >= unlifted.d[j])[0])
-    z, info = _moved(system, unlifted, t, guess, args)
-    if len(levels.states) > 0:
-        lifted = _Lifted(system, t, z, args, levels)
-        root = find_root(without_derivative(lifted), z[levels.states], _MAX_STEPS)
-        z = lifted.point(implicit_root(lifted, root))
-    residual, regular = _check(system, t, z, args)
-    solved = residual <= NewtonProjection().tolerance_for(z.dtype)
-    success = info.success & solved & regular
-    info = dataclasses.replace(info, residual=residual, success=success)
+    t = as_time(t0, guess.z.dtype)
+    z, info, regular = _found(system, t, guess.z, tuple(guess.fixed.tolist()), args)
     if throw:
         _explain(system, t, z, args, guess, info, regular)
-        messages = _messages(guess)
-        cause = jnp.where(info.full_rank, jnp.where(solved, 2, 1), 0)
-        cause = jnp.where(success, 0, cause)
-        z = eqx.branched_error_if(z, ~success, cause, messages)
+        near = info.residual <= NewtonProjection().tolerance_for(z.dtype)
+        cause = jnp.where(info.full_rank, jnp.where(near, 2, 1), 0)
+        cause = jnp.where(info.success, 0, cause)
+        z = _raise_unless(info.success, z, cause, tuple(_messages(guess)))
     return z, info
 
 
-def _moved(
-    system: Reduced, unlifted: Structure, t: Array, guess: Guess, args: Args
-) -> tuple[Array, ProjectionInfo]:
-    """Onto what holds of the state without the unknowns that became states."""
-    if unlifted.c.sum() == 0:
-        residual = jnp.zeros((), guess.z.dtype)
-        finite = jnp.all(jnp.isfinite(guess.z))
-        return guess.z, ProjectionInfo.of_formula(guess.z, guess.z, residual, finite)
-    weights = jnp.asarray(np.where(guess.fixed, np.inf, 1), guess.z.dtype)
-    projection = NewtonProjection(metric=weights, max_steps=_MAX_STEPS)
-    manifold = ReducedConstraint(system, tuple(unlifted.c.tolist()))
-    return manifold.correct(projection, t, guess.z, args, far=True)
+@clear_errors
+@eqx.filter_jit
+def _raise_unless(success: BoolScalar, z: Array, cause: Array, messages: tuple[str, ...]) -> Array:
+    return eqx.branched_error_if(z, ~success, cause, messages)
 
 
-def _check(system: Reduced, t: Array, z: Array, args: Args) -> tuple[Array, BoolScalar]:
-    """The largest scaled residual, and whether the derivatives are determined."""
+@eqx.filter_jit
+def _found(
+    system: Reduced, t: Array, guess: Array, held: tuple[bool, ...], args: Args
+) -> tuple[Array, ProjectionInfo, BoolScalar]:
+    """The state, what was done, and whether the derivatives are determined there."""
+    fixed = np.array(held, bool)
+    given, finite = guess, jnp.all(jnp.isfinite(guess))
+    guess = jnp.where(finite, guess, 0)
+    nearest = nearest_state(system, t, guess, fixed, args)
+    z = with_lifted(system, t, nearest.z, args)
     closing = without_derivative(system.closing(t, z, args))
     regular = closing.linearize(closing.z).full_rank
-    manifold = ReducedConstraint(system)
-    r, G = jacobian(lambda z: manifold(closing.t, z, closing.args), closing.z)
-    if r.size == 0:
-        return jnp.zeros((), z.dtype), regular
-    return jnp.max(jnp.abs(r) / row_scale(G, closing.z)), regular
+    constraint = lambda z: ReducedConstraint(system)(closing.t, z, closing.args)
+    r, G = jacobian(constraint, closing.z)
+    level = jnp.max(jnp.abs(r) / row_scale(G, closing.z), initial=0)
+    moving = G * jnp.asarray(np.where(fixed, 0, 1), G.dtype)[None, :]
+    full_rank = Pivoted.of(gram(G, moving)).full_rank if r.size > 0 else jnp.asarray(True)
+    near = level <= NewtonProjection().tolerance_for(z.dtype)
+    success = finite & near & nearest.settled & full_rank & regular
+    correction = jnp.max(jnp.abs(closing.z - guess) / (jnp.abs(guess) + 1), initial=0)
+    info = ProjectionInfo(
+        multipliers=nearest.multipliers,
+        iterations=nearest.iterations,
+        residual=jnp.where(finite, level, jnp.nan),
+        correction=jax.lax.stop_gradient(correction),
+        full_rank=full_rank,
+        success=success,
+    )
+    return jnp.where(finite, z, given), info, regular
 
 
 def _messages(guess: Guess) -> list[str]:

@@ -101,4 +101,4 @@ def landing(equation: Any, operand: tuple, indices: np.ndarray, update: tuple) -
     with jax.ensure_compile_time_eval():
         places = jnp.asarray(1.0 + np.arange(int(np.prod(operand))).reshape(operand))
         (found,) = jax.linear_transpose(scattered, jnp.zeros(update, places.dtype))(places)
-    return np.asarray(np.rint(found), int) - 1
+    return np.asarray(np.rint(np.asarray(found)) - 1, int).reshape(update)

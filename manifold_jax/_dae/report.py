@@ -129,7 +129,7 @@ class DAEReport:
 
 
 def _listed(names: tuple[str, ...] | list[str]) -> str:
-    return listed(list(names), most=12).replace("`", "")
+    return listed(list(names), most=8).replace("`", "")
 
 
 def _count(number: int, name: str) -> str:

@@ -42,7 +42,7 @@ class ReducedDAE(eqx.Module):
         args: Args = None,
         *,
         derivatives: tuple[Y, ...] = (),
-        fixed: tuple[str, ...] = (),
+        fixed: Any = (),
         throw: bool = True,
     ) -> tuple[Float[Array, " states"], ProjectionInfo]:
         r"""A state near a guess that satisfies the equations and all that follows from them.
