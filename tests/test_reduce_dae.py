@@ -129,7 +129,7 @@ def test_gradients_alone_and_in_a_batch(reduced):
 
     def by_hand(args):
         manifold = mj.Constraint(models.pendulum_constraint)
-        start, _ = mj.consistent_state(manifold, 0.0, PENDULUM_GUESS[:4], args)
+        start, _ = dae.consistent_state(0.0, PENDULUM_GUESS, args)
         terms = dfx.ODETerm(models.pendulum_field)
         return solve(terms, manifold, start, args, 0.5, 1e-8).ys[-1, 0]
 
@@ -157,8 +157,7 @@ def test_derivatives_of_the_field(reduced, name):
     start, _ = dae.consistent_state(0.0, x, args)
     near = start + 0.1
     weights = jnp.asarray(np.random.default_rng(1).normal(size=start.shape))
-    for f in (dae.terms.vf, dae.constraint):
-        hand = field if f is not dae.constraint else BY_HAND[name][5]
+    for f, hand in ((dae.terms.vf, field), (dae.constraint, BY_HAND[name][5])):
         weigh = lambda f: lambda z, args: weights[: len(f(0.0, z, args))] @ f(0.0, z, args)
         ours = jax.jit(jax.grad(weigh(f), argnums=(0, 1)))(near, args)
         theirs = jax.grad(weigh(hand), argnums=(0, 1))(near, args)

@@ -32,7 +32,7 @@ class Guess(NamedTuple):
     names: tuple[str, ...]  # of what is fixed, as given
 
     @staticmethod
-    def of(system: Reduced, x: Y, derivatives: tuple[Y, ...], fixed: tuple[str, ...]) -> "Guess":
+    def of(system: Reduced, x: Y, derivatives: Any, fixed: Any) -> "Guess":
         layout, scale = system.static.plan.layout, system.static.plan.layout.scale()
         given = [_flat(system, x, "x_guess")]
         given += [_flat(system, dx, f"derivatives[{k}]") for k, dx in enumerate(derivatives)]
@@ -48,7 +48,7 @@ class Guess(NamedTuple):
             else:
                 numbers.append(jnp.zeros((), given[0].dtype))
         z = jnp.stack(numbers) if numbers else jnp.zeros((0,), given[0].dtype)
-        return Guess(z, _fixed(system, x, fixed), fixed)
+        return Guess(z, _fixed(system, x, fixed), tuple(fixed))
 
 
 def _flat(system: Reduced, x: Y, name: str) -> Array:

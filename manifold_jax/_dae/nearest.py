@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._custom_types import Args, BoolScalar, IntScalar
+from .._custom_types import Args, BoolScalar, FloatScalar, IntScalar
 from .._linear import combine, gram, multiply
 from .._newton import (
     AbstractEquations,
@@ -30,8 +30,8 @@ from .constraint import hidden_constraints, Reduced
 from .pivots import Pivoted
 
 
-# Without the curvature each iteration gains a factor only, the distance over the radius.
-_MAX_STEPS = 200
+# Of an iteration that gains a factor each time.
+_MAX_STEPS = 300
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -79,35 +79,62 @@ class _Nearest(AbstractEquations):
         return Pivoted.of(jax.jacfwd(self.residual)(x))
 
 
-class _Flat(NamedTuple):
-    """`[[1, W^-1 G^T], [G, 0]]`, the same without the curvature of the manifold."""
+class _LeastChange(NamedTuple):
+    """Of the state, with a given rate of the residual: across the manifold."""
 
     G: Float[Array, "m n"]
     directions: Float[Array, "m n"]
     crossing: Pivoted
 
-    def solve(self, b: Float[Array, " k"]) -> Float[Array, " k"]:
-        upper, lower = b[: self.G.shape[1]], b[self.G.shape[1] :]
-        y = self.crossing.solve(multiply(self.G, upper) - lower)
-        return jnp.concatenate([upper - combine(y, self.directions), y])
+    def solve(self, b: Float[Array, " m"]) -> Float[Array, " n"]:
+        return combine(self.crossing.solve(b), self.directions)
 
 
-class _Approached(AbstractEquations):
-    """The same equations, for an iteration that needs no second derivatives."""
+def _across(g: Constrained, z: Float[Array, " n"]) -> tuple[Float[Array, " m"], _LeastChange]:
+    r, G = jacobian(g, z)
+    directions = G * g.free[None, :]
+    return r, _LeastChange(G, directions, Pivoted.of(gram(G, directions)))
 
-    g: Constrained
-    guess: Float[Array, " n"]
 
-    def point(self, z: Float[Array, " k"]) -> Float[Array, " k"]:
-        return z
+class _Approach(NamedTuple):
+    """Of the nearest point: the state, its multipliers, how far they are from stationary, and the
+    part of the step across the manifold that is taken."""
 
-    def residual(self, x: Float[Array, " k"]) -> Float[Array, " k"]:
-        return _stationarity(self.g, self.guess, x)
+    z: Float[Array, " n"]
+    multipliers: Float[Array, " m"]
+    level: FloatScalar
+    damping: FloatScalar
+    iterations: IntScalar
 
-    def linearize(self, x: Float[Array, " k"]) -> _Flat:
-        G = jacobian(self.g, x[: self.guess.size])[1]
-        directions = G * self.g.free[None, :]
-        return _Flat(G, directions, Pivoted.of(gram(G, directions)))
+
+def _approach(g: Constrained, guess: Float[Array, " n"], m: int) -> _Approach:
+    """Across the manifold by Gauss-Newton steps, smaller ones while the residual grows, and along
+    it by half the distance that a flat manifold would ask for: that converges up to three radii
+    of curvature away, and needs no second derivatives."""
+    g, guess = without_derivative((g, guess))
+    rounding = float(jnp.finfo(guess.dtype).eps)
+
+    def advance(state: _Approach) -> _Approach:
+        offset = guess - state.z
+        r, across = _across(g, state.z)
+        multipliers = across.crossing.solve(multiply(across.G, offset))
+        along = offset - combine(multipliers, across.directions)
+        step = across.solve(r)
+        there = jnp.max(jnp.abs(step)) <= 1e-2 * (1 + jnp.max(jnp.abs(state.z)))
+        z = state.z - state.damping * step
+        better = there | (jnp.max(jnp.abs(g(z))) < jnp.max(jnp.abs(r)))
+        z = jnp.where(better, z, state.z) + jnp.where(there, along / 2, 0)
+        level = jnp.maximum(jnp.max(jnp.abs(along)), jnp.max(jnp.abs(step)))
+        damping = jnp.where(better, jnp.ones_like(level), state.damping / 4)
+        return _Approach(z, multipliers, level, damping, state.iterations + 1)
+
+    def unfinished(state: _Approach) -> BoolScalar:
+        size = 1 + jnp.max(jnp.abs(state.z))
+        return (state.level > rounding * size) & (state.iterations < _MAX_STEPS)
+
+    one, none = jnp.ones((), guess.dtype), jnp.zeros((m,), guess.dtype)
+    start = _Approach(guess, none, jnp.inf * one, one, jnp.zeros((), jnp.int32))
+    return jax.lax.while_loop(unfinished, advance, start)
 
 
 class NearestState(NamedTuple):
@@ -130,8 +157,8 @@ def nearest_state(
         return NearestState(guess, none, jnp.zeros((), jnp.int32), jnp.asarray(True))
     levels = Levels(np.zeros_like(unlifted.c), unlifted.c)
     g = Constrained(system, t, args, jnp.asarray(np.where(fixed, 0, 1), guess.dtype), levels)
-    near = _damped(_Approached(g, guess), jnp.concatenate([guess, jnp.zeros((m,), guess.dtype)]))
-    root = implicit_root(_Nearest(g, guess), near.z)
+    near = _approach(g, guess, m)
+    root = implicit_root(_Nearest(g, guess), jnp.concatenate([near.z, near.multipliers]))
     settled = near.level <= float(jnp.finfo(guess.dtype).eps) ** 0.5 * (
         1 + jnp.max(jnp.abs(near.z))
     )
