@@ -23,6 +23,7 @@ EXACT = {
     "assembled": lambda x: jnp.zeros(4).at[jnp.array([1, 1, 2])].add(x[:3]),
     "replaced": lambda x: x.at[2:4].set(x[:2]),
     "picked": lambda x: x[jnp.array([3, 1])] * x[0],
+    "from nowhere": lambda x: x.at[jnp.array([9, 1])].get(mode="fill", fill_value=0.0),
     "loop": lambda x: jax.lax.fori_loop(0, 3, lambda i, c: c.at[i + 1].add(x[i]), jnp.zeros(6)),
     "scan": lambda x: jax.lax.scan(lambda c, a: (c + a, c * a), 0.0, x[::-1], reverse=True)[1],
     "einsum": lambda x: jnp.einsum("ij,j->i", x.reshape(2, 3), jnp.array([1.0, 0, 1])),

@@ -96,8 +96,11 @@ def test_field_and_constraint_are_those_by_hand(reduced, name):
         jax.vmap(field, (None, 0, None)),
     )
     states = jnp.stack([start, near])
-    expected = theirs(0.3, states, args)
-    np.testing.assert_allclose(ours(0.3, states, args), expected, rtol=1e-11, atol=1e-11)
+    other = jax.tree.map(lambda leaf: 1.1 * leaf, args)  # than those of the example
+    for parameters in (args, other):
+        expected = theirs(0.3, states, parameters)
+        found = ours(0.3, states, parameters)
+        np.testing.assert_allclose(found, expected, rtol=1e-11, atol=1e-11)
     if constraint is None:
         assert dae.report.num_constraints == 0
     else:
@@ -171,6 +174,41 @@ def test_derivatives_of_the_field(reduced, name):
     along = jax.jit(lambda dz: jax.jvp(lambda z: dae.terms.vf(0.0, z, args), (near,), (dz,))[1])
     expected = jax.jvp(lambda z: field(0.0, z, args), (near,), (weights,))[1]
     np.testing.assert_allclose(along(weights), expected, rtol=1e-10, atol=1e-10)
+
+
+@pytest.mark.slow
+def test_every_approach_and_an_ensemble(reduced):
+    dae, args = reduced("pendulum"), jax.tree.map(jnp.asarray, models.PENDULUM_ARGS)
+    start, _ = dae.consistent_state(0.0, PENDULUM_GUESS, args)
+    exact = reference(models.pendulum_field, start, args, 1.0)
+    control = dfx.PIDController(rtol=1e-8, atol=1e-8)
+    gain = mj.InvariantStabilization(5.0)
+    hooks = [
+        mj.Projected(dfx.Tsit5(), dae.constraint),
+        mj.Stabilized(dfx.Tsit5(), dae.constraint, stabilization=gain),
+        mj.LocalCoordinates(dfx.Tsit5(), dae.constraint),
+    ]
+    problem = 0.0, 1.0, None
+    for hook in hooks:
+        sol = mj.diffeqsolve(dae.terms, hook, *problem, start, args, stepsize_controller=control)
+        np.testing.assert_allclose(sol.ys[-1], exact, rtol=0, atol=1e-6)
+    many = {**args, "g": jnp.array([5.0, args["g"]])}
+    settings = {"in_axes": {"g": 0, "m": None, "L": None}, "stepsize_controller": control}
+    starts = jnp.tile(start, (2, 1))
+    ensemble = mj.solve_ensemble(dae.terms, hooks[0], *problem, starts, many, **settings)
+    np.testing.assert_allclose(ensemble.ys[1, -1], exact, rtol=0, atol=1e-6)
+
+
+def test_single_precision():
+    x, args = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), TWO_LINKS)
+    dae = mj.reduce_dae(models.chain, x, args)
+    z, info = dae.consistent_state(0.0, x, args)
+    assert z.dtype == jnp.float32
+    assert info.success
+    field = jax.jit(dae.terms.vf)(jnp.float32(0), z, args)
+    assert field.dtype == jnp.float32
+    exact = models.chain_field(0.0, z.astype(float), jax.tree.map(lambda x: x.astype(float), args))
+    np.testing.assert_allclose(field, exact, rtol=1e-5, atol=1e-5)
 
 
 def test_no_freedom_is_left_to_a_crane():
