@@ -18,6 +18,7 @@ from .._projection import NewtonProjection
 from .._projection_info import ProjectionInfo
 from .._residual import as_time, jacobian, row_scale
 from .constraint import Reduced, ReducedConstraint
+from .layout import Gather, Layout
 from .names import leaf_names, listed
 from .nearest import nearest_state, with_lifted
 from .pivots import Pivoted
@@ -33,22 +34,26 @@ class Guess(NamedTuple):
 
     @staticmethod
     def of(system: Reduced, x: Y, derivatives: Any, fixed: Any) -> "Guess":
-        layout, scale = system.static.plan.layout, system.static.plan.layout.scale()
         given = [_flat(system, x, "x_guess")]
         given += [_flat(system, dx, f"derivatives[{k}]") for k, dx in enumerate(derivatives)]
-        aliases, numbers = layout.aliases, []
-        for (k, unknown), size in zip(layout.names.tolist(), scale, strict=True):
-            same = np.nonzero(aliases.root == aliases.root[unknown])[0]
-            level = k + aliases.shift[unknown]
-            orders = [(level - aliases.shift[other], other) for other in same]
-            known = [(r, other) for r, other in sorted(orders) if 0 <= r < len(given)]
-            if known:
-                r, other = min(known, key=lambda pair: (pair[0] != k, pair[0]))
-                numbers.append(given[r][other] * (size / aliases.factor[other]))
-            else:
-                numbers.append(jnp.zeros((), given[0].dtype))
-        z = jnp.stack(numbers) if numbers else jnp.zeros((0,), given[0].dtype)
+        z = _places_in_guess(system.static.plan.layout, len(given))(jnp.concatenate(given), None)
         return Guess(z, _fixed(system, x, fixed), tuple(fixed))
+
+
+def _places_in_guess(layout: Layout, number: int) -> Gather:
+    """Where each number of the state is in the guesses of `x, x', ...`, as many as are given: under
+    its own name, or as a derivative of another unknown."""
+    aliases, n = layout.aliases, len(layout.aliases.root)
+    index, scale = [], []
+    for k, unknown in layout.names.tolist():
+        level = k + aliases.shift[unknown] - aliases.shift
+        (others,) = np.nonzero(
+            (aliases.root == aliases.root[unknown]) & (level >= 0) & (level < number)
+        )
+        other = unknown if unknown in others else next(iter(others), unknown)
+        index.append(level[other] * n + other if other in others else -1)
+        scale.append(aliases.factor[unknown] / aliases.factor[other])
+    return Gather(np.array(index, int), np.array(scale, float))
 
 
 def _flat(system: Reduced, x: Y, name: str) -> Array:
