@@ -41,6 +41,19 @@ class Elimination(NamedTuple):
                 return Elimination(rows, columns, *others, sign)
         return Elimination(rows, columns, *others, 0)
 
+    @property
+    def is_definite(self) -> bool:
+        """Large ones are factored by the library, which exchanges rows in any case."""
+        return self.sign != 0 and len(self.other_rows) <= UNROLL_LIMIT
+
+    def factorize(self, S: Float[Array, "k k"]) -> "Factorization | Pivoted":
+        return factorize(self.sign * S) if self.is_definite else Pivoted.of(S)
+
+    def solve_rest(
+        self, rest: "Factorization | Pivoted", b: Float[Array, " k"]
+    ) -> Float[Array, " k"]:
+        return rest.solve(self.sign * b if self.is_definite else b)
+
 
 def _independent_pivots(
     constant: np.ndarray, samples: list[np.ndarray]
@@ -87,8 +100,7 @@ class Eliminated(NamedTuple):
         S = entries.block(derivatives, plan.other_rows, plan.other_columns)
         if len(plan.rows) > 0:
             S = S - gram(below, (right / pivots[:, None]).T)
-        rest = Pivoted.of(S) if plan.sign == 0 else factorize(plan.sign * S)
-        return Eliminated(plan, pivots, right, below, rest)
+        return Eliminated(plan, pivots, right, below, plan.factorize(S))
 
     @property
     def full_rank(self) -> BoolScalar:
@@ -102,10 +114,10 @@ class Eliminated(NamedTuple):
         if self.rest is None:
             return pick(upper / self.pivots, order)
         if len(plan.rows) == 0:
-            y = self.rest.solve(plan.sign * lower if plan.sign else lower)
+            y = plan.solve_rest(self.rest, lower)
             return pick(y, order)
         lower = lower - multiply(self.below, upper / self.pivots)
-        y = self.rest.solve(plan.sign * lower if plan.sign else lower)
+        y = plan.solve_rest(self.rest, lower)
         x = (upper - multiply(self.right, y)) / self.pivots
         return pick(jnp.concatenate([x, y]), order)
 
