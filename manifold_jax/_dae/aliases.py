@@ -7,6 +7,7 @@ are half of all.
 
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -82,8 +83,6 @@ def _candidates(equations: Equations, occurrence: Occurrence, point: Point) -> l
 
 
 def _along(equations: Equations, point: Point, zero: Any, ones: Any, higher: list) -> Any:
-    import equinox as eqx
-
     @jax.jit
     def evaluate(t: Any, args: Any) -> Any:
         args = eqx.combine(args, point.fixed_args)

@@ -6,6 +6,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 
 
 def _squeeze(parameters: dict, x: np.ndarray) -> np.ndarray:
@@ -84,8 +85,6 @@ def bind(equation: Any, operands: list[np.ndarray], parameters: dict) -> list[np
 def landing(equation: Any, operand: tuple, indices: np.ndarray, update: tuple) -> np.ndarray:
     """Where each number of the update of a scatter goes: its index in the flat operand, -1 if it is
     dropped. Shapes of operand and update."""
-    from jax import lax
-
     keep = ("indices_are_sorted", "unique_indices", "mode")
     settings = {name: equation.params[name] for name in keep}
 
