@@ -20,6 +20,11 @@ from ._constraint import (
     Constraint as Constraint,
     Invariants as Invariants,
 )
+from ._dae import (
+    DAEReport as DAEReport,
+    reduce_dae as reduce_dae,
+    ReducedDAE as ReducedDAE,
+)
 from ._ensemble import (
     EnsembleSolution as EnsembleSolution,
     open_ensemble as open_ensemble,

@@ -29,7 +29,7 @@ LAYERS = [
     {"_adjoint"},
     {"_solve"},
     {"_mechanics"},
-    {"_applications", "_ensemble"},
+    {"_applications", "_dae", "_ensemble"},
     {"_fit"},
     {"_manifolds", "_lie_groups"},
     {"problems"},

@@ -2,6 +2,7 @@ import dataclasses
 import json
 import math
 import re
+import sys
 from decimal import Decimal
 
 import diffrax as dfx
@@ -532,3 +533,60 @@ def test_module_runs_as_a_program():
     output = subprocess.run(command, capture_output=True, text=True, check=True)
     for name in ("list", "compare", "paper"):
         assert name in output.stdout
+
+
+# reduce
+
+
+MODEL = """
+import jax.numpy as jnp
+
+def pendulum():
+    def F(t, x, xdot, args):
+        q, v = x["q"], x["v"]
+        force = jnp.stack([0 * args["g"], args["g"]])
+        return {"rates": xdot["q"] - v, "motion": xdot["v"] + x["pull"] * q + force, "rod": q @ q - 1}
+    return F, {"q": jnp.ones(2), "v": jnp.ones(2), "pull": 0.0}, {"g": 9.81}
+
+def second_order():
+    return lambda t, x, xdot, xddot, args: xddot + x, jnp.ones(2), None, 2
+
+def singular():
+    return lambda t, x, xdot, args: jnp.stack([x[0] - 1, x[0] - t]), jnp.ones(2)
+
+def nothing():
+    return 1
+"""
+
+
+@pytest.fixture
+def model(tmp_path, monkeypatch):
+    (tmp_path / "some_model.py").write_text(MODEL)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delitem(sys.modules, "some_model", raising=False)
+
+
+def test_reduce_prints_the_structure(model):
+    result = run("reduce", "some_model:pendulum")
+    assert result.exit_code == 0, result.output
+    lines = result.stdout.splitlines()
+    assert lines[0].startswith("index 3, 2 degrees of freedom")
+    assert ["rod", ".", "0", "0", ".", ".", "2"] in [line.split() for line in lines]
+    assert "state: q[0], q[1], v[0], v[1]" in lines
+    second = run("reduce", "some_model:second_order")
+    assert "state: x[0], x[1], x[0]', x[1]'" in second.stdout
+
+
+def test_reduce_says_what_is_wrong(model):
+    result = run("reduce", "some_model:singular")
+    assert result.exit_code == 1
+    assert "structurally singular" in result.stdout
+    for place, message in (
+        ("some_model", "must be a module and a function"),
+        ("some_model:absent", "no attribute 'absent'"),
+        ("absent_model:pendulum", "No module named 'absent_model'"),
+        ("some_model:nothing", "must return"),
+    ):
+        wrong = run("reduce", place)
+        assert wrong.exit_code == 2
+        assert message in unframed(wrong.stderr)

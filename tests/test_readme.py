@@ -14,7 +14,16 @@ README = Path(__file__).parents[1] / "README.md"
 BLOCKS = re.findall(r"```python\n(.*?)```", README.read_text(), flags=re.DOTALL)
 # What the others need of the first one, as the text says: the imports and the setting.
 PREAMBLE = BLOCKS[0].split("\n\n\n")[0]
-NAMES = ["fifteen lines", "mechanism", "curves and minima", "fit", "ensemble", "stream", "extend"]
+NAMES = [
+    "fifteen lines",
+    "mechanism",
+    "dae",
+    "curves and minima",
+    "fit",
+    "ensemble",
+    "stream",
+    "extend",
+]
 
 
 @pytest.fixture(autouse=True)
@@ -43,6 +52,16 @@ def check_mechanism(namespace):
     q = np.asarray(namespace["motion"].ys[0][-1])
     np.testing.assert_allclose(np.linalg.norm([q[0], q[1] - q[0]], axis=1), 1, atol=1e-15)
     assert namespace["forces"].shape == (2,)
+
+
+def check_dae(namespace):
+    """Newton's law of the whole: what drives it accelerates both masses."""
+    x, xdot, t = namespace["x"], namespace["xdot"], namespace["led"].ts
+    np.testing.assert_allclose(x["position"], np.sin(t), rtol=0, atol=1e-15)
+    both = 3 * xdot["speed"] + xdot["velocity"][:, 0]
+    np.testing.assert_allclose(x["drive"], both, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(xdot["speed"], -np.sin(t), rtol=0, atol=1e-12)
+    assert namespace["dae"].report.index == 3
 
 
 def check_curves_and_minima(namespace):
@@ -90,6 +109,7 @@ def check_extend(namespace):
 CHECKS = (
     check_fifteen_lines,
     check_mechanism,
+    check_dae,
     check_curves_and_minima,
     check_fit,
     check_ensemble,

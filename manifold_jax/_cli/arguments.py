@@ -1,9 +1,11 @@
 """What was asked for on the command line, or an error that says what could have been."""
 
+import importlib
 import math
+import sys
 from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import Any, TYPE_CHECKING, TypeVar
 
 import typer
 
@@ -74,6 +76,32 @@ def check_name(name: str, known: Iterable[str], kind: str, hint: str) -> None:
         raise typer.BadParameter(
             f"there is no {kind} {name!r}. Choose one of: {', '.join(known)}.", param_hint=hint
         )
+
+
+def model_at(place: str) -> tuple[Any, Any, Any, int]:
+    """What the function at `MODULE:FUNCTION` returns: `F`, `x_example`, `args_example`, `order`."""
+    module, _, name = place.partition(":")
+    if not module or not name:
+        raise typer.BadParameter(
+            f"must be a module and a function in it, such as `model:pendulum`; got {place!r}.",
+            param_hint="MODULE:FUNCTION",
+        )
+    sys.path.insert(0, str(Path.cwd()))
+    try:
+        function = getattr(importlib.import_module(module), name)
+        model = function()
+    except (ImportError, AttributeError, TypeError) as error:
+        raise typer.BadParameter(f"{error}.", param_hint="MODULE:FUNCTION") from error
+    finally:
+        sys.path.pop(0)
+    if not isinstance(model, tuple) or not 2 <= len(model) <= 4:
+        raise typer.BadParameter(
+            f"{place} must return `(F, x_example, args_example)`, and `order` if it is not 1.",
+            param_hint="MODULE:FUNCTION",
+        )
+    F, x, *further = model
+    args, order = (*further, *(None, 1)[len(further) :])
+    return F, x, args, order
 
 
 def check_positive(value: float, option: str) -> None:

@@ -8,14 +8,23 @@ from typing import Annotated
 
 import typer
 
-from .arguments import check_positive, check_target, choose, FIGURE_TYPES, names_in, task_for
+from .arguments import (
+    check_positive,
+    check_target,
+    choose,
+    FIGURE_TYPES,
+    model_at,
+    names_in,
+    task_for,
+)
 from .console import output_console, print_table, progress_bar
 
 
 app = typer.Typer(
     name="manifold-jax",
     help="Differential equations on manifolds: look at the gallery of problems, compare "
-    "solvers, solve one many times, reprint the paper's table. Computes in double precision.",
+    "solvers, solve one many times, reduce the index of equations, reprint the paper's table. "
+    "Computes in double precision.",
     no_args_is_help=True,
     add_completion=False,
     rich_markup_mode="markdown",  # which joins the lines of a paragraph
@@ -230,6 +239,39 @@ def certify(
         output.print(note, style="dim", highlight=False, markup=False)
     if not all(_certify.is_certified(row) for row in rows):
         raise typer.Exit(1)
+
+
+@app.command()
+def reduce(
+    model: Annotated[
+        str,
+        typer.Argument(
+            metavar="MODULE:FUNCTION",
+            help="A function without arguments that returns `(F, x_example, args_example)`, and `order` "
+            "as a fourth if it is not 1; the module is looked for in this folder, too.",
+        ),
+    ],
+) -> None:
+    """Reduce the index of a differential-algebraic equation F(t, x, x', args) = 0, and print how.
+
+    Prints the signature matrix (the highest derivative of each unknown in each equation), how
+    often each equation has to be differentiated (c) and up to which derivative each unknown then
+    occurs (d), the index, the degrees of freedom, the names of the numbers in the state, and how
+    well conditioned the equations for the highest derivatives are.
+
+    Exits with 1 if the equations cannot be reduced, and says which of them are at fault.
+    """
+    arguments = model_at(model)
+    from .._dae import reduce_dae
+
+    output = output_console()
+    try:
+        F, x, args, order = arguments
+        dae = reduce_dae(F, x, args, order=order)
+    except (TypeError, ValueError) as error:
+        output.print(str(error), highlight=False, markup=False)
+        raise typer.Exit(1) from None
+    output.print(str(dae.report), highlight=False, markup=False, no_wrap=True, crop=False)
 
 
 @app.command()

@@ -1,0 +1,94 @@
+"""Unknowns that are derivatives of others by an equation like `x' - v = 0`.
+
+Such a `v` is the derivative `x'` under another name, and the equation is one that needs neither
+to be differentiated nor solved: `v'` is `x''`. In equations written for first derivatives these
+are half of all.
+"""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from .equations import Equations
+from .occurrence import Occurrence, Point
+
+
+class Aliases(NamedTuple):
+    """Unknown `k` is `factor[k]` times derivative `shift[k]` of unknown `root[k]`; `equations` are
+    those that say nothing else."""
+
+    root: np.ndarray
+    shift: np.ndarray
+    factor: np.ndarray
+    equations: np.ndarray
+
+    @property
+    def roots(self) -> np.ndarray:
+        """The unknowns that are left."""
+        return np.nonzero(self.root == np.arange(len(self.root)))[0]
+
+    @property
+    def rows(self) -> np.ndarray:
+        """The equations that are left."""
+        return np.setdiff1d(np.arange(len(self.root)), self.equations)
+
+    @staticmethod
+    def of(equations: Equations, occurrence: Occurrence, point: Point) -> "Aliases":
+        n = equations.n
+        root, shift, factor = np.arange(n), np.zeros(n, int), np.ones(n)
+        used = []
+        for row, (unknown, order), target, ratio in _candidates(equations, occurrence, point):
+            new = root[unknown] != target and root[target] == target
+            if not new:  # a second equation for it, or a chain that is closed
+                continue
+            follows = root == target  # the target itself, and what is known as its derivative
+            shift[follows] += order + shift[unknown]
+            factor[follows] *= ratio * factor[unknown]
+            root[follows] = root[unknown]
+            used.append(row)
+        return Aliases(root, shift, factor, np.array(used, int))
+
+    def merged(self, there: np.ndarray) -> np.ndarray:
+        """Of an array `(equations, derivatives, unknowns)` of bools: that of the equations and
+        unknowns that are left."""
+        n, levels = there.shape[1:][::-1]
+        out = np.zeros((n, levels + int(self.shift.max(initial=0)), n), bool)
+        for k in range(n):
+            out[:, self.shift[k] : self.shift[k] + levels, self.root[k]] |= there[:, :, k]
+        return out[self.rows][:, :, self.roots]
+
+
+def _candidates(equations: Equations, occurrence: Occurrence, point: Point) -> list[Any]:
+    """Equations `a x^(s) + b v = 0` with constants `a`, `b`: `(row, (x, s), v, -a / b)`."""
+    there = occurrence.there
+    constant = ~(
+        occurrence.depends_on_time | occurrence.depends_on_args | occurrence.coefficients_vary
+    )
+    two = (there.sum(axis=(1, 2)) == 2) & (there[:, 0].sum(axis=1) == 1) & constant
+    if not two.any():
+        return []
+    zero, ones = jnp.zeros_like(point.jets[0]), jnp.ones_like(point.jets[0])
+    higher = [zero] * equations.order
+    values, a, b = (np.asarray(x) for x in _along(equations, point, zero, ones, higher))
+    found = []
+    for row in np.nonzero(two & (values == 0) & (a != 0) & (b != 0))[0]:
+        (order,), (unknown,) = np.nonzero(there[row, 1:])
+        (target,) = np.nonzero(there[row, 0])[0]
+        if target != unknown:
+            found.append((row, (unknown, order + 1), target, -a[row] / b[row]))
+    return found
+
+
+def _along(equations: Equations, point: Point, zero: Any, ones: Any, higher: list) -> Any:
+    @jax.jit
+    def evaluate(t: Any, args: Any) -> Any:
+        args = eqx.combine(args, point.fixed_args)
+        at = lambda *jets: equations(t, jets, args)
+        values, a = jax.jvp(at, (zero, *higher), (zero, *(ones for _ in higher)))
+        _, b = jax.jvp(at, (zero, *higher), (ones, *higher))
+        return values, a, b
+
+    return evaluate(point.t, point.args)

@@ -1,0 +1,95 @@
+"""The equations that are solved for the leading derivatives."""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from .._custom_types import Args
+from .._newton import AbstractEquations, implicit_root, without_derivative
+from .compressed import Compressed
+from .derivatives import total_derivatives
+from .equations import Equations
+from .layout import Layout
+from .picking import pick
+from .pivots import Eliminated, Elimination
+from .signature import Structure
+
+
+class Plan(NamedTuple):
+    """All that is known of a reduced system before it is evaluated."""
+
+    layout: Layout
+    entries: Compressed
+    elimination: Elimination
+    order: int
+    unlifted: Structure  # with the fewest differentiations
+
+    def jets(
+        self, z: Float[Array, " a"], w: Float[Array, " n"] | None, differentiations: int
+    ) -> tuple[Array, ...]:
+        return self.layout.jets(z, w, self.order + 1 + differentiations)
+
+    def rows_below(self, k: int) -> np.ndarray:
+        """Equations that are differentiated more than `k` times: `F^(k)` holds of states alone."""
+        return self.layout.aliases.rows[self.layout.structure.c > k]
+
+    @property
+    def differentiations(self) -> int:
+        return int(self.layout.structure.c.max(initial=0))
+
+
+class Static:
+    """Anything, compared by identity."""
+
+    def __init__(self, plan: Plan):
+        self.plan = plan
+
+
+class Closing(AbstractEquations):
+    """`F_i^(c_i) = 0`, linear in the leading derivatives `w_j = x_j^(d_j)`, at one state."""
+
+    equations: Equations
+    t: Array
+    z: Float[Array, " a"]
+    args: Args
+    static: Static = eqx.field(static=True)
+
+    def point(self, z: Float[Array, " n"]) -> Float[Array, " n"]:
+        return z
+
+    def residual(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
+        return self._residual(x)
+
+    def _residual(self, w: Float[Array, " n"] | None) -> Float[Array, " n"]:
+        plan = self.static.plan
+        c, rows = plan.layout.structure.c, plan.layout.aliases.rows
+        order = plan.differentiations
+        jets = plan.jets(self.z, w, order)
+        levels = total_derivatives(self.equations, self.t, jets, self.args, order)
+        parts = [pick(levels[k], rows[c == k]) for k in range(order + 1)]
+        return pick(jnp.concatenate(parts), np.argsort(np.argsort(c, kind="stable")))
+
+    def linearize(self, x: Float[Array, " n"]) -> Eliminated:
+        """The same for all `w`."""
+        del x
+        plan = self.static.plan
+        jets = plan.jets(self.z, None, 0)
+        derivatives = plan.entries.derivatives(self.equations, self.t, jets, self.args)
+        return Eliminated.of(plan.elimination, plan.entries, derivatives)
+
+    def matrix(self) -> Float[Array, "n n"]:
+        jets, entries = self.static.plan.jets(self.z, None, 0), self.static.plan.entries
+        return entries.matrix(entries.derivatives(self.equations, self.t, jets, self.args))
+
+    def solve(self) -> Float[Array, " n"]:
+        """NaN where the equations do not determine all of them. The derivative is that of the
+        solution: only the residual is differentiated, not the matrix."""
+        fixed = without_derivative(self)
+        matrix = fixed.linearize(self.z)
+        w = -matrix.solve(fixed._residual(None))
+        w = implicit_root(self, jnp.where(matrix.full_rank, w, 0))
+        # Added, not selected: the derivative of a discarded NaN would be NaN.
+        return w + jnp.where(matrix.full_rank, 0, jnp.nan).astype(w.dtype)

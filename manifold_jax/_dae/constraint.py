@@ -1,0 +1,94 @@
+"""The manifold of a reduced system."""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.flatten_util as jfu
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from .._constraint import AbstractConstraint
+from .._custom_types import Args, BoolScalar, RealScalarLike, Y
+from .._newton import implicit_root
+from .._residual import as_time
+from .closing import Closing, Static
+from .derivatives import total_derivatives
+from .equations import Equations
+from .picking import pick
+
+
+_SINGULAR = (
+    "The equations of `F` do not determine all derivatives at `{y}`: some of them depend on the others there "
+    "(redundant), or `{y}` is a singular configuration. `dae.consistent_state`, called outside of `jit`, says which."
+)
+
+
+class Reduced(eqx.Module):
+    """Equations with the plan of their reduction, all that the parts of a system share."""
+
+    equations: Equations
+    static: Static = eqx.field(static=True)
+
+    def closing(self, t: Any, z: Array, args: Args) -> Closing:
+        return Closing(self.equations, as_time(t, z.dtype), z, args, self.static)
+
+
+class ReducedConstraint(AbstractConstraint):
+    """`F_i = 0, F_i' = 0, ..., F_i^(c_i - 1) = 0`: what the equations and their derivatives say
+    of the state alone. Lower derivatives first. Built by `reduce_dae`."""
+
+    system: Reduced
+    redundant: bool = eqx.field(static=True, default=False)
+
+    def __call__(self, t: RealScalarLike, y: Y, args: Args = None) -> Float[Array, " m"]:
+        c = self.system.static.plan.layout.structure.c
+        return hidden_constraints(self.system, t, y, args, np.zeros_like(c), c)
+
+    def faults(self, t, y, args=None) -> tuple[tuple[BoolScalar, str], ...]:
+        closing = self.system.closing(t, jfu.ravel_pytree(y)[0], args)
+        return ((~closing.linearize(closing.z).full_rank, _SINGULAR),)
+
+
+def hidden_constraints(
+    system: Reduced, t: Any, z: Array, args: Args, first: np.ndarray, end: np.ndarray
+) -> Float[Array, " m"]:
+    """`F_i^(k)` for `first_i <= k < end_i`."""
+    plan, t = system.static.plan, as_time(t, z.dtype)
+    rows, order = plan.layout.aliases.rows, int(end.max(initial=0)) - 1
+    if order < 0:
+        return jnp.zeros((0,), z.dtype)
+    jets = plan.jets(z, None, order)
+    levels = total_derivatives(system.equations, t, jets, args, order)
+    parts = [pick(levels[k], rows[(first <= k) & (k < end)]) for k in range(order + 1)]
+    return jnp.concatenate(parts)
+
+
+def rate(system: Reduced, t: Any, z: Array, args: Args) -> Float[Array, " a"]:
+    """The vector field."""
+    return system.static.plan.layout.rate()(z, system.closing(t, z, args).solve())
+
+
+def unknowns_with_derivatives(
+    system: Reduced, t: Any, z: Array, args: Args, number: int
+) -> list[Float[Array, " n"]]:
+    """`x, x', ...` up to that derivative, by differentiating along the solution."""
+    layout = system.static.plan.layout
+    w = system.closing(t, z, args).solve()
+
+    def leading(t: Array, z: Array) -> Array:
+        """Solved for only once: nearby, the same as the function that the equations define."""
+        return implicit_root(system.closing(t, z, args), w)
+
+    def differentiated(function: Callable) -> Callable:
+        return lambda t, z: jax.jvp(
+            function, (t, z), (jnp.ones_like(t), layout.rate()(z, leading(t, z)))
+        )[1]
+
+    t, function, found = as_time(t, z.dtype), lambda t, z: layout.jet(0)(z, leading(t, z)), []
+    for _ in range(number + 1):
+        found.append(function(t, z))
+        function = differentiated(function)
+    return found

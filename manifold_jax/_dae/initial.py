@@ -1,0 +1,188 @@
+"""Consistent initial values."""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.flatten_util as jfu
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+from jaxtyping import Array, Float
+
+from .._custom_types import Args, BoolScalar, RealScalarLike, Y
+from .._errors import clear_errors
+from .._linear import gram
+from .._newton import without_derivative
+from .._projection import NewtonProjection
+from .._projection_info import ProjectionInfo
+from .._residual import as_time, jacobian, row_scale
+from .constraint import Reduced, ReducedConstraint
+from .layout import Gather, Layout
+from .names import leaf_names, listed
+from .nearest import nearest_state, with_lifted
+from .pivots import Pivoted
+from .samples import condition, dependent_rows, singular_below
+
+
+class Guess(NamedTuple):
+    """A state, and which of its numbers may not move."""
+
+    z: Float[Array, " states"]
+    fixed: np.ndarray
+    names: tuple[str, ...]  # of what is fixed, as given
+
+    @staticmethod
+    def of(system: Reduced, x: Y, derivatives: Any, fixed: Any) -> "Guess":
+        given = [_flat(system, x, "x_guess")]
+        given += [_flat(system, dx, f"derivatives[{k}]") for k, dx in enumerate(derivatives)]
+        z = _places_in_guess(system.static.plan.layout, len(given))(jnp.concatenate(given), None)
+        return Guess(z, _fixed(system, x, fixed), tuple(fixed))
+
+
+def _places_in_guess(layout: Layout, number: int) -> Gather:
+    """Where each number of the state is in the guesses of `x, x', ...`, as many as are given: under
+    its own name, or as a derivative of another unknown."""
+    aliases, n = layout.aliases, len(layout.aliases.root)
+    index, scale = [], []
+    for k, unknown in layout.names.tolist():
+        level = k + aliases.shift[unknown] - aliases.shift
+        (others,) = np.nonzero(
+            (aliases.root == aliases.root[unknown]) & (level >= 0) & (level < number)
+        )
+        other = unknown if unknown in others else next(iter(others), unknown)
+        index.append(level[other] * n + other if other in others else -1)
+        scale.append(aliases.factor[unknown] / aliases.factor[other])
+    return Gather(np.array(index, int), np.array(scale, float))
+
+
+def _flat(system: Reduced, x: Y, name: str) -> Array:
+    leaves, structure = system.equations.shapes
+    x = jtu.tree_map(jnp.asarray, x)
+    shapes = [leaf.shape for leaf in jtu.tree_leaves(x)]
+    if jtu.tree_structure(x) != structure or shapes != [leaf.shape for leaf in leaves]:
+        raise ValueError(
+            f"`{name}` must be like `x_example`, {structure} of shapes {[leaf.shape for leaf in leaves]}; got "
+            f"{jtu.tree_structure(x)} of shapes {shapes}."
+        )
+    floating = jtu.tree_map(
+        lambda leaf, like: leaf.astype(like.dtype), jtu.tree_leaves(x), [*leaves]
+    )
+    return jfu.ravel_pytree(floating)[0]
+
+
+def _fixed(system: Reduced, x: Y, fixed: Any) -> np.ndarray:
+    if isinstance(fixed, str) or not all(isinstance(name, str) for name in fixed):
+        raise TypeError(
+            f"`fixed` must be a tuple of names, such as ('{system.equations.names.unknowns[0]}',), got {fixed!r}."
+        )
+    plan, unknowns = system.static.plan, system.equations.names
+    states = [unknowns.derivative(j, k) for k, j in plan.layout.names.tolist()]
+    groups = dict(leaf_names(x, "x"))
+    held = np.zeros(len(states), bool)
+    for name in fixed:
+        whole, primes = name.rstrip("'"), len(name) - len(name.rstrip("'"))
+        numbers = [entry + "'" * primes for entry in groups.get(whole, [whole])]
+        missing = [number for number in numbers if number not in states]
+        if missing:
+            raise ValueError(
+                f"`fixed` names {listed(missing)}, not of the state, whose numbers are {listed(states, 20)}. What "
+                "is not in the state follows from it."
+            )
+        held |= np.isin(states, numbers)
+    return held
+
+
+def consistent_state(
+    system: Reduced, t0: RealScalarLike, guess: Guess, args: Args, throw: bool
+) -> tuple[Array, ProjectionInfo]:
+    t = as_time(t0, guess.z.dtype)
+    z, info, regular = _found(system, t, guess.z, tuple(guess.fixed.tolist()), args)
+    if throw:
+        _explain(system, t, z, args, guess, info, regular)
+        near = info.residual <= NewtonProjection().tolerance_for(z.dtype)
+        cause = jnp.where(info.full_rank, jnp.where(near, 2, 1), 0)
+        cause = jnp.where(info.success, 0, cause)
+        z = _raise_unless(info.success, z, cause, tuple(_messages(guess)))
+    return z, info
+
+
+@clear_errors
+@eqx.filter_jit
+def _raise_unless(success: BoolScalar, z: Array, cause: Array, messages: tuple[str, ...]) -> Array:
+    return eqx.branched_error_if(z, ~success, cause, messages)
+
+
+@eqx.filter_jit
+def _found(
+    system: Reduced, t: Array, guess: Array, held: tuple[bool, ...], args: Args
+) -> tuple[Array, ProjectionInfo, BoolScalar]:
+    """The state, what was done, and whether the derivatives are determined there."""
+    fixed = np.array(held, bool)
+    given, finite = guess, jnp.all(jnp.isfinite(guess))
+    guess = jnp.where(finite, guess, 0)
+    nearest = nearest_state(system, t, guess, fixed, args)
+    z = with_lifted(system, t, nearest.z, args)
+    closing = without_derivative(system.closing(t, z, args))
+    regular = closing.linearize(closing.z).full_rank
+    constraint = lambda z: ReducedConstraint(system)(closing.t, z, closing.args)
+    r, G = jacobian(constraint, closing.z)
+    level = jnp.max(jnp.abs(r) / row_scale(G, closing.z), initial=0)
+    moving = G * jnp.asarray(np.where(fixed, 0, 1), G.dtype)[None, :]
+    full_rank = Pivoted.of(gram(G, moving)).full_rank if r.size > 0 else jnp.asarray(True)
+    near = level <= NewtonProjection().tolerance_for(z.dtype)
+    success = finite & near & nearest.settled & full_rank & regular
+    correction = jnp.max(jnp.abs(closing.z - guess) / (jnp.abs(guess) + 1), initial=0)
+    info = ProjectionInfo(
+        multipliers=nearest.multipliers,
+        iterations=nearest.iterations,
+        residual=jnp.where(finite, level, jnp.nan),
+        correction=jax.lax.stop_gradient(correction),
+        full_rank=full_rank,
+        success=success,
+    )
+    return jnp.where(finite, z, given), info, regular
+
+
+def _messages(guess: Guess) -> list[str]:
+    held = f" with {listed(list(guess.names))} fixed" if guess.names else ""
+    advice = " Fix less, or other unknowns." if guess.names else ""
+    return [
+        f"The equations of `F` and their derivatives cannot be satisfied near `x_guess`{held}: they depend on each "
+        f"other there.{advice} Remove equations that follow from others, or start elsewhere.",
+        f"No state near `x_guess` satisfies the equations of `F` and their derivatives{held}.{advice} Start closer, or "
+        "check that they can hold at the same time.",
+        "The equations of `F` do not determine all derivatives at the start: some depend on the others there "
+        "(redundant), or it is a singular configuration.",
+    ]
+
+
+def _explain(
+    system: Reduced,
+    t: Array,
+    z: Array,
+    args: Args,
+    guess: Guess,
+    info: ProjectionInfo,
+    regular: BoolScalar,
+) -> None:
+    """With numbers at hand, say which equations are singular."""
+    if any(isinstance(x, jax.core.Tracer) for x in jtu.tree_leaves((t, z, args, info))):
+        return
+    if bool(info.success) or (guess.fixed.any() and bool(regular)):
+        return
+    closing = system.closing(t, z, args)
+    matrix = np.asarray(closing.matrix())
+    if not np.isfinite(matrix).all():
+        raise ValueError(
+            "`F` or its derivatives are not finite at the start. Give an `x_guess` where they are."
+        )
+    if condition(matrix) > 10 * singular_below(matrix.dtype):
+        return
+    names = system.equations.names.equations
+    rows = system.static.plan.layout.aliases.rows[dependent_rows(matrix)]
+    raise ValueError(
+        f"The equations {listed([names[i] for i in rows])} of `F`, differentiated as often as necessary, depend on each "
+        "other at the start: they are redundant (remove one of them), or this is a singular configuration (start "
+        "elsewhere). The derivatives are not determined there."
+    )

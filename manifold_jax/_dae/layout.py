@@ -1,0 +1,88 @@
+"""Where each number stands: derivatives of unknowns in the state, equations in the constraint."""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from .aliases import Aliases
+from .picking import pick
+from .signature import Structure
+
+
+class Gather(NamedTuple):
+    """`scale * (z, w)[index]`, zero where the index is negative."""
+
+    index: np.ndarray
+    scale: np.ndarray
+
+    def __call__(self, z: Float[Array, " a"], w: Float[Array, " b"] | None) -> Float[Array, " n"]:
+        """`w = None` for zeros."""
+        source = z if w is None else jnp.concatenate([z, w])
+        index = np.where(self.index < source.shape[0], self.index, -1)
+        picked = pick(source, index)
+        if (self.scale[index >= 0] == 1).all():
+            return picked
+        return picked * jnp.asarray(self.scale, z.dtype)
+
+
+class Layout(NamedTuple):
+    """Of the state `z`: for each number the derivative and the unknown under whose name it goes
+    (`names`), and for each that is left of the unknowns the place of its derivatives below `d_j`
+    (`places[m, j]`, then that of `x_j^(d_j)` in the leading derivatives `w`, behind `z`)."""
+
+    structure: Structure
+    aliases: Aliases
+    names: np.ndarray  # (states, 2): derivative, unknown
+    places: np.ndarray  # (levels, roots)
+
+    @property
+    def num_states(self) -> int:
+        return len(self.names)
+
+    @staticmethod
+    def of(structure: Structure, aliases: Aliases, order: int) -> "Layout":
+        """The user's own unknowns first, in their order, then derivatives without a name."""
+        n, d = len(aliases.root), structure.d
+        compact = np.full(n, -1)
+        compact[aliases.roots] = np.arange(len(aliases.roots))
+        places = np.full((int(d.max(initial=0)) + 1, len(d)), -1)
+        names = []
+        for k in range(int(d.max(initial=0)) + 1):
+            for unknown in range(n):
+                m, j = k + aliases.shift[unknown], compact[aliases.root[unknown]]
+                if m < d[j] and places[m, j] < 0:
+                    places[m, j] = len(names)
+                    names.append((k, unknown))
+        places[d, np.arange(len(d))] = len(names) + np.arange(len(d))
+        return Layout(structure, aliases, np.array(names, int).reshape(-1, 2), places)
+
+    def scale(self) -> np.ndarray:
+        """A state is that many times the derivative of the unknown that is left."""
+        return self.aliases.factor[self.names[:, 1]]
+
+    def _scales(self) -> np.ndarray:
+        return np.concatenate([self.scale(), np.ones(len(self.structure.d))])
+
+    def jet(self, k: int) -> Gather:
+        """Derivative `k` of all unknowns."""
+        root = self.aliases.root
+        j = np.searchsorted(self.aliases.roots, root)
+        level = k + self.aliases.shift
+        inside = level < len(self.places)
+        index = np.where(inside, self.places[np.where(inside, level, 0), j], -1)
+        return Gather(index, self.aliases.factor / self._scales()[index])
+
+    def rate(self) -> Gather:
+        """The derivative of the state."""
+        level, unknown = self.names.T
+        j = np.searchsorted(self.aliases.roots, self.aliases.root[unknown])
+        index = self.places[level + self.aliases.shift[unknown] + 1, j]
+        return Gather(index, self.scale() / self._scales()[index])
+
+    def jets(
+        self, z: Float[Array, " a"], w: Float[Array, " b"] | None, number: int
+    ) -> tuple[Float[Array, " n"], ...]:
+        """The first derivatives of all unknowns, as far as they are known; else zero."""
+        return tuple(self.jet(k)(z, w) for k in range(number))

@@ -1,0 +1,164 @@
+"""Linear systems with constant pivots, which are eliminated first."""
+
+from typing import Any, Literal, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.scipy.linalg as jsl
+import numpy as np
+from jaxtyping import Array, Float
+
+from .._custom_types import BoolScalar
+from .._linear import Factorization, factorize, gram, multiply, reduction, UNROLL_LIMIT
+from .compressed import Compressed
+from .picking import pick
+
+
+# Of a pivot, relative to the largest entry of its row.
+_SMALLEST_PIVOT = 1e-6
+
+
+class Elimination(NamedTuple):
+    """Which pivots are taken: `J[rows, columns]` is diagonal and constant. Of what is left the
+    symmetric part may be definite, positive or negative (`sign`), or not (0)."""
+
+    rows: np.ndarray
+    columns: np.ndarray
+    other_rows: np.ndarray
+    other_columns: np.ndarray
+    sign: Literal[-1, 0, 1]
+
+    @staticmethod
+    def of(constant: np.ndarray, samples: list[np.ndarray]) -> "Elimination":
+        """From samples of the matrix, and where it is constant."""
+        rows, columns = _independent_pivots(constant, samples)
+        n = constant.shape[0]
+        others = [np.setdiff1d(np.arange(n), taken) for taken in (rows, columns)]
+        left = [_schur_complement(J, rows, columns, *others) for J in samples]
+        for sign in (1, -1):
+            if all(_is_definite(sign * S) for S in left):
+                return Elimination(rows, columns, *others, sign)
+        return Elimination(rows, columns, *others, 0)
+
+    @property
+    def is_definite(self) -> bool:
+        """Large ones are factored by the library, which exchanges rows in any case."""
+        return self.sign != 0 and len(self.other_rows) <= UNROLL_LIMIT
+
+    def factorize(self, S: Float[Array, "k k"]) -> "Factorization | Pivoted":
+        return factorize(self.sign * S) if self.is_definite else Pivoted.of(S)
+
+    def solve_rest(
+        self, rest: "Factorization | Pivoted", b: Float[Array, " k"]
+    ) -> Float[Array, " k"]:
+        return rest.solve(self.sign * b if self.is_definite else b)
+
+
+def _independent_pivots(
+    constant: np.ndarray, samples: list[np.ndarray]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Greedily: no entry in the row or column of another."""
+    size = np.min([np.abs(J) / np.abs(J).max(axis=1, keepdims=True) for J in samples], axis=0)
+    there = np.any([J != 0 for J in samples], axis=0)
+    good = constant & (size > _SMALLEST_PIVOT)
+    rows, columns = [], []
+    for i, j in sorted(np.argwhere(good).tolist(), key=lambda ij: there[ij[0]].sum()):
+        if not there[i, columns].any() and not there[rows, j].any():
+            rows.append(i)
+            columns.append(j)
+    order = np.argsort(np.array(columns, int))
+    return np.array(rows, int)[order], np.array(columns, int)[order]
+
+
+def _schur_complement(J: np.ndarray, r: Any, c: Any, other_r: Any, other_c: Any) -> np.ndarray:
+    half = J[np.ix_(other_r, c)] / J[r, c]
+    return J[np.ix_(other_r, other_c)] - half @ J[np.ix_(r, other_c)]
+
+
+def _is_definite(S: np.ndarray) -> bool:
+    symmetric = np.abs(S - S.T).max(initial=0) <= 1e-10 * np.abs(S).max(initial=0)
+    return bool(symmetric and (np.linalg.eigvalsh(S) > 0).all())
+
+
+class Eliminated(NamedTuple):
+    """A matrix with its pivots eliminated, and the rest factored."""
+
+    plan: Elimination
+    pivots: Float[Array, " p"]
+    right: Float[Array, "p k"]
+    below: Float[Array, "k p"]
+    rest: "Factorization | Pivoted | None"
+
+    @staticmethod
+    def of(plan: Elimination, entries: Compressed, derivatives: Array) -> "Eliminated":
+        pivots = entries.diagonal(derivatives, plan.rows, plan.columns)
+        right = entries.block(derivatives, plan.rows, plan.other_columns)
+        below = entries.block(derivatives, plan.other_rows, plan.columns)
+        if len(plan.other_rows) == 0:
+            return Eliminated(plan, pivots, right, below, None)
+        S = entries.block(derivatives, plan.other_rows, plan.other_columns)
+        if len(plan.rows) > 0:
+            S = S - gram(below, (right / pivots[:, None]).T)
+        return Eliminated(plan, pivots, right, below, plan.factorize(S))
+
+    @property
+    def full_rank(self) -> BoolScalar:
+        regular = jnp.all(self.pivots != 0)
+        return regular if self.rest is None else regular & self.rest.full_rank
+
+    def solve(self, b: Float[Array, " n"]) -> Float[Array, " n"]:
+        plan = self.plan
+        upper, lower = pick(b, plan.rows), pick(b, plan.other_rows)
+        order = np.argsort(np.concatenate([plan.columns, plan.other_columns]))
+        if self.rest is None:
+            return pick(upper / self.pivots, order)
+        if len(plan.rows) == 0:
+            y = plan.solve_rest(self.rest, lower)
+            return pick(y, order)
+        lower = lower - multiply(self.below, upper / self.pivots)
+        y = plan.solve_rest(self.rest, lower)
+        x = (upper - multiply(self.right, y)) / self.pivots
+        return pick(jnp.concatenate([x, y]), order)
+
+
+class Pivoted(eqx.Module):
+    """Any square matrix, equilibrated and factored with row exchanges, and whether its rank was
+    full. The derivative is that of `A x = b`."""
+
+    A: Float[Array, "k k"]
+    scales: tuple[Array, Array]  # of rows and columns, held fixed
+    factors: Any
+    full_rank: BoolScalar
+
+    @staticmethod
+    def of(A: Float[Array, "k k"]) -> "Pivoted":
+        k, fixed = A.shape[0], jax.lax.stop_gradient(A)
+        one = lambda size: jnp.where(size > 0, 1 / jnp.where(size > 0, size, 1), 1)
+        rows = one(jnp.max(jnp.abs(fixed), axis=1))
+        columns = one(jnp.max(jnp.abs(fixed) * rows[:, None], axis=0))
+        scaled = fixed * rows[:, None] * columns[None, :]
+        threshold = 10 * k * float(jnp.finfo(A.dtype).eps)
+        if k <= UNROLL_LIMIT:
+            factors = reduction(scaled)[0]
+            full_rank = jnp.max(jnp.abs(factors)) * threshold < 1  # not so of NaN
+        else:
+            factors = jsl.lu_factor(scaled)
+            full_rank = jnp.all(jnp.abs(jnp.diagonal(factors[0])) > threshold)
+        return Pivoted(A, (rows, columns), factors, full_rank)
+
+    def solve(self, b: Float[Array, " k"]) -> Float[Array, " k"]:
+        A, (rows, columns), factors = self.A, self.scales, self.factors
+
+        def solve(transposed: bool, b: Array) -> Array:
+            left, right = (columns, rows) if transposed else (rows, columns)
+            if isinstance(factors, tuple):
+                return right * jsl.lu_solve(factors, left * b, trans=int(transposed))
+            return right * multiply(factors.T if transposed else factors, left * b)
+
+        return jax.lax.custom_linear_solve(
+            lambda x: multiply(A, x),
+            b,
+            lambda _, b: solve(False, b),
+            lambda _, b: solve(True, b),
+        )

@@ -1,0 +1,155 @@
+"""From equations to a vector field on a manifold."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.flatten_util as jfu
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+
+from .._custom_types import Args, Y
+from .aliases import Aliases
+from .closing import Plan, Static
+from .compressed import Compressed
+from .constraint import Reduced
+from .equations import Equations
+from .layout import Layout
+from .lifting import lifted
+from .names import listed
+from .occurrence import Occurrence, Point
+from .pivots import Elimination
+from .report import DAEReport
+from .samples import dependent_rows, Samples
+from .signature import signature, SingularParts, Structure
+from .system import ReducedDAE
+
+
+def reduce_dae(
+    F: Callable, x_example: Y, args_example: Args = None, *, order: int = 1
+) -> ReducedDAE:
+    r"""Reduce a differential-algebraic equation of any index,
+
+    $$F(t, x, x', \dots, x^{(\mathrm{order})}, \mathrm{args}) = 0,$$
+
+    written as ordinary JAX code, to a vector field on a manifold.
+
+    ```python
+    def pendulum(t, x, xdot, args):
+        q, v, tension = x["q"], x["v"], x["tension"]
+        force = -tension * q - jnp.array([0.0, 9.81])
+        return xdot["q"] - v, xdot["v"] - force, q @ q - 1.0
+
+
+    dae = mj.reduce_dae(pendulum, {"q": jnp.ones(2), "v": jnp.ones(2), "tension": 1.0})
+    z0, _ = dae.consistent_state(0.0, {"q": ..., "v": ..., "tension": 0.0})
+    sol = mj.diffeqsolve(dae.terms, mj.Projected(dfx.Tsit5(), dae.constraint), 0.0, 5.0, None, z0)
+    x, xdot = jax.vmap(dae.outputs)(sol.ts, sol.ys)
+    ```
+
+    Structure alone decides which equation has to be differentiated how often (`c_i`) and up to
+    which derivative unknowns then occur (`d_j`). The derivatives below `d_j` are the state, the
+    equations and their derivatives below `c_i` its constraint, and `F_i^(c_i) = 0` are solved for
+    the derivatives `d_j`: one linear system, whose matrix has first derivatives of `F` only.
+    Equations like `x' - v = 0` drop out, so that the state of equations of first order consists
+    of the user's own unknowns. An unknown like the voltage of a diode, of which an equation is a
+    nonlinear function, becomes a state, too.
+
+    **Arguments:**
+
+    - `F`: `F(t, x, x', args)`, or with `x''` and `x'''` as `order` says. Returns any pytree of real
+        arrays, as many numbers as `x` has, zero on solutions. It must be differentiable forwards
+        (no `jax.custom_vjp`) as often as equations are differentiated.
+    - `x_example`: a pytree of real floating-point arrays like `x`, with numbers at which `F` is
+        defined. They need not be consistent.
+    - `args_example`: parameters like those that will be used. Their values decide nothing but
+        whether the reduced equations are regular; arrays closed over by `F` are constants, whose
+        zeros count as structure.
+    - `order`: the highest derivative among the arguments of `F`, 1 to 3.
+
+    **Returns:**
+
+    A [`ReducedDAE`][], with the names `terms`, `constraint`, `consistent_state`, `outputs` and
+    `report`. All its functions work under `jit`, `vmap` and both modes of differentiation.
+
+    **Raises:**
+
+    `ValueError` if there are not as many equations as unknowns, if the structure is singular (with
+    the over- and underdetermined parts), if the reduced equations are singular though their
+    structure is not, or under `jit`: structure is found before anything is compiled.
+    `TypeError` for arguments of the wrong kind and for `jax.custom_vjp` in `F`.
+
+    Structure cannot see what cancels. Problems of index 1 with a constant singular matrix,
+    `M x' = f(t, x)`, may fail here for that reason; use `mj.MassMatrixTerm` with `mj.Rodas5P`
+    for those. For mechanisms [`MechanicalSystem`][] compiles to less and corrects positions and
+    velocities in the metric of the masses.
+
+    Source: J. D. Pryce, A simple structural analysis method for DAEs, BIT 41 (2001) 364-394.
+    """
+    _check_concrete(x_example, args_example)
+    equations = Equations.of(F, x_example, args_example, order)
+    x = jfu.ravel_pytree(jtu.tree_map(jnp.asarray, x_example))[0]
+    point = Point.of(equations, x, args_example)
+    occurrence = Occurrence.of(equations, point)
+    written = _structure(equations, occurrence.there)
+    aliases = Aliases.of(equations, occurrence, point)
+    there = aliases.merged(occurrence.there)
+    unlifted = Structure.of(signature(there))
+    assert unlifted is not None
+    structure = lifted(equations, aliases, unlifted, point)
+    layout = Layout.of(structure, aliases, order)
+    entries = Compressed.of(structure, aliases, there, order + 1)
+    samples = Samples.of(equations, layout, entries, point)
+    report = DAEReport.of(equations, occurrence, written, unlifted, layout, samples)
+    if samples.singular:
+        raise ValueError(_singular(equations, aliases, samples, report))
+    constant = structure.leading & ~_at(aliases.merged(occurrence.varies), structure.sigma)
+    elimination = Elimination.of(constant, samples.matrices)
+    plan = Plan(layout, entries, elimination, order, unlifted)
+    return ReducedDAE(Reduced(equations, Static(plan)), report)
+
+
+def _check_concrete(x: Any, args: Any) -> None:
+    if any(isinstance(leaf, jax.core.Tracer) for leaf in jtu.tree_leaves((x, args))):
+        raise ValueError(
+            "`reduce_dae` cannot be called under `jax.jit`, `jax.vmap` or `jax.grad`: structure is found before anything "
+            "is compiled. Call it once outside, with numbers for `x_example` and `args_example`; what it returns "
+            "takes traced `args`."
+        )
+
+
+def _structure(equations: Equations, there: np.ndarray) -> Structure:
+    structure = Structure.of(signature(there))
+    if structure is not None:
+        return structure
+    parts, names = SingularParts.of(there.any(axis=1)), equations.names
+    named = lambda part: (
+        listed([names.equations[i] for i in part[0]]),
+        listed([names.unknowns[j] for j in part[1]]) or "none",
+    )
+    over, under = named(parts.overdetermined), named(parts.underdetermined)
+    raise ValueError(
+        f"`F` is structurally singular. The equations {over[0]} are too many for the unknowns in them: {over[1]}. The "
+        f"unknowns {under[1]} are left to too few equations: {under[0] or 'none'}. Replace an equation of the "
+        "first part by one for the unknowns of the second."
+    )
+
+
+def _at(there: np.ndarray, levels: np.ndarray) -> np.ndarray:
+    """`there[i, levels[i, j], j]`."""
+    level = np.maximum(levels, 0)[:, None, :]
+    return np.take_along_axis(there, level, axis=1)[:, 0]
+
+
+def _singular(equations: Equations, aliases: Aliases, samples: Samples, report: DAEReport) -> str:
+    rows = aliases.rows[dependent_rows(samples.matrices[0])]
+    names = listed([equations.names.equations[i] for i in rows])
+    return (
+        f"`F` is structurally regular (index {report.index}, {report.degrees_of_freedom} degrees of freedom), but the "
+        f"matrix of its leading derivatives is singular wherever it was evaluated (reciprocal condition "
+        f"{max(samples.conditions):.0e} at best): the equations {names} depend on each other there. Either they are "
+        "redundant, or terms cancel that structure cannot see and the index is higher (a hidden index): combine "
+        "those equations so that the cancelled derivatives are gone. For a problem of index 1 with a constant "
+        "singular matrix, M x' = f(t, x), use `mj.MassMatrixTerm` with `mj.Rodas5P`."
+    )

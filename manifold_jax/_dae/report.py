@@ -1,0 +1,136 @@
+"""What the reduction found, for people."""
+
+import dataclasses
+
+import numpy as np
+
+from .equations import Equations
+from .layout import Layout
+from .names import listed
+from .occurrence import Occurrence
+from .samples import Samples
+from .signature import ABSENT, Structure
+
+
+# Equations and unknowns up to which the whole signature matrix is printed.
+_MOST_PRINTED = 16
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class DAEReport:
+    """The structure of a [`ReducedDAE`][]; `print(dae.report)` shows it as a table.
+
+    - `equations`, `unknowns`: names of the numbers in `F` and `x`.
+    - `sigma`: the signature matrix, shape `(n, n)`: the highest derivative of each unknown in each
+        equation, -1 where it is absent.
+    - `c`, `d`: the offsets, `(n,)` each: how often each equation is differentiated, and up to which
+        derivative each unknown then occurs.
+    - `index`: the structural index, `max c`, and one more where an unknown is only found
+        algebraically.
+    - `degrees_of_freedom`: `sum d - sum c`, how many initial values are free.
+    - `states`: names of the numbers of the state; `num_constraints` equations hold of them.
+    - `dropped`: equations like `x' - v = 0`, which are solved by name.
+    - `lifted`: unknowns that became states as an equation is a nonlinear function of them.
+    - `condition`: the largest over the smallest singular value of the matrix of the leading
+        derivatives, equilibrated, at the best of a few points near the example.
+    - `fallbacks`: primitives of JAX without a rule for what depends on what, and how often they
+        occur: of those everything counts as depending on everything, which is safe, but may cost
+        differentiations.
+    """
+
+    equations: tuple[str, ...]
+    unknowns: tuple[str, ...]
+    sigma: np.ndarray
+    c: np.ndarray
+    d: np.ndarray
+    index: int
+    degrees_of_freedom: int
+    states: tuple[str, ...]
+    num_constraints: int
+    dropped: tuple[str, ...]
+    lifted: tuple[str, ...]
+    condition: float
+    fallbacks: dict[str, int]
+
+    @staticmethod
+    def of(
+        equations: Equations,
+        occurrence: Occurrence,
+        written: Structure,
+        unlifted: Structure,
+        layout: Layout,
+        samples: Samples,
+    ) -> "DAEReport":
+        names, structure = equations.names, layout.structure
+        raised = layout.aliases.roots[structure.d > unlifted.d]
+        best = max(samples.conditions)
+        return DAEReport(
+            equations=names.equations,
+            unknowns=names.unknowns,
+            sigma=np.where(written.sigma == ABSENT, -1, written.sigma),
+            c=written.c,
+            d=written.d,
+            index=written.index,
+            degrees_of_freedom=written.degrees_of_freedom,
+            states=tuple(names.derivative(unknown, k) for k, unknown in layout.names.tolist()),
+            num_constraints=int(structure.c.sum()),
+            dropped=tuple(names.equations[i] for i in layout.aliases.equations),
+            lifted=tuple(names.unknowns[j] for j in raised),
+            condition=1 / best if best > 0 else float("inf"),
+            fallbacks=occurrence.unknown_primitives,
+        )
+
+    def __str__(self) -> str:
+        n, lines = len(self.unknowns), []
+        lines.append(
+            f"index {self.index}, {_count(self.degrees_of_freedom, 'degree')} of freedom: {_count(n, 'equation')} "
+            f"reduced to {_count(len(self.states), 'state')} with {_count(self.num_constraints, 'constraint')}"
+        )
+        if n <= _MOST_PRINTED:
+            lines += ["", *self._matrix(), ""]
+        else:
+            lines.append(f"differentiated: {self._grouped()}")
+        lines.append(f"state: {_listed(self.states)}")
+        if self.dropped:
+            lines.append(f"solved by name: {_listed(self.dropped)}")
+        if self.lifted:
+            lines.append(f"states, too, as equations are nonlinear in them: {_listed(self.lifted)}")
+        lines.append(
+            f"condition of the equations for the highest derivatives: {self.condition:.1e}"
+        )
+        if self.fallbacks:
+            times = [f"{name} ({number})" for name, number in self.fallbacks.items()]
+            lines.append(f"taken to depend on all of their inputs: {', '.join(times)}")
+        return "\n".join(lines)
+
+    def _matrix(self) -> list[str]:
+        """The signature matrix with the offsets beside and below it."""
+        body = [["." if s < 0 else str(s) for s in row] for row in self.sigma.tolist()]
+        table = [["", *self.unknowns, "c"]]
+        table += [
+            [name, *row, str(c)]
+            for name, row, c in zip(self.equations, body, self.c.tolist(), strict=True)
+        ]
+        table.append(["d", *map(str, self.d.tolist()), ""])
+        widths = [max(map(len, column)) for column in zip(*table, strict=True)]
+        return [
+            "  ".join(
+                cell.ljust(width) if k == 0 else cell.rjust(width)
+                for k, (cell, width) in enumerate(zip(row, widths, strict=True))
+            ).rstrip()
+            for row in table
+        ]
+
+    def _grouped(self) -> str:
+        groups: dict[int, list[str]] = {}
+        for name, c in zip(self.equations, self.c.tolist(), strict=True):
+            groups.setdefault(c, []).append(name)
+        return "; ".join(f"{c} times {_listed(groups[c])}" for c in sorted(groups))
+
+
+def _listed(names: tuple[str, ...] | list[str]) -> str:
+    return listed(list(names), most=8).replace("`", "")
+
+
+def _count(number: int, name: str) -> str:
+    return f"{number} {name}{'' if number == 1 else 's'}"

@@ -1,0 +1,92 @@
+"""The matrix of the leading derivatives at a few points: is it regular?"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from .closing import Closing, Plan, Static
+from .compressed import Compressed
+from .equations import Equations
+from .layout import Layout
+from .occurrence import Point
+from .pivots import Elimination
+
+
+# How far from the example, relative and absolute: where the equations are not defined, nearer.
+_DISTANCES = (0.5, 0.5, 0.5, 0.1, 0.01, 1e-3)
+
+
+class Samples(NamedTuple):
+    """Matrices, equilibrated, and the smallest over the largest singular value of each."""
+
+    matrices: list[np.ndarray]
+    conditions: list[float]
+
+    @property
+    def singular(self) -> bool:
+        return max(self.conditions) < singular_below(self.matrices[0].dtype)
+
+    @staticmethod
+    def of(equations: Equations, layout: Layout, entries: Compressed, point: Point) -> "Samples":
+        nothing = np.zeros(0, int)
+        plan = Plan(
+            layout, entries, Elimination(*[nothing] * 4, 0), equations.order, layout.structure
+        )
+        static = Static(plan)
+
+        @jax.jit
+        def matrix(t: Array, z: Array, args: object) -> Array:
+            args = eqx.combine(args, point.fixed_args)
+            return Closing(equations, t, z, args, static).matrix()
+
+        matrices = []
+        for t, z in _points(layout, np.asarray(point.jets[0])):
+            sample = np.asarray(matrix(t, jnp.asarray(z), point.args))
+            if np.isfinite(sample).all():
+                matrices.append(sample)
+        if not matrices:
+            raise ValueError(
+                "`F` or its derivatives are not finite near `x_example` (with random numbers for its derivatives). Give "
+                "an example where F is defined, and parameters in `args_example` as they will be used."
+            )
+        return Samples(matrices, [condition(matrix) for matrix in matrices])
+
+
+def singular_below(dtype: np.dtype) -> float:
+    return float(np.finfo(dtype).eps) ** 0.75
+
+
+def _points(layout: Layout, x: np.ndarray) -> list[tuple[Array, np.ndarray]]:
+    random = np.random.default_rng(0)
+    order, unknown = layout.names.T
+    found = []
+    for distance in _DISTANCES:
+        z = np.where(order == 0, x[unknown], 0)
+        z = z + np.where(order == 0, distance * (1 + np.abs(z)), 1) * random.normal(size=z.shape)
+        found.append((jnp.asarray(random.uniform(), x.dtype), z.astype(x.dtype)))
+    return found
+
+
+def equilibrated(matrix: np.ndarray) -> np.ndarray:
+    for axis in (1, 0, 1, 0):
+        size = np.abs(matrix).max(axis=axis, keepdims=True)
+        matrix = matrix / np.where(size > 0, size, 1)
+    return matrix
+
+
+def condition(matrix: np.ndarray) -> float:
+    if matrix.size == 0:
+        return 1.0
+    values = np.linalg.svd(equilibrated(matrix), compute_uv=False)
+    return float(values[-1] / values[0]) if values[0] > 0 else 0.0
+
+
+def dependent_rows(matrix: np.ndarray) -> np.ndarray:
+    """Which rows of a singular matrix take part in its dependence."""
+    left, values, _ = np.linalg.svd(equilibrated(matrix))
+    null = left[:, values <= 1e3 * singular_below(matrix.dtype) * values[0]]
+    return np.nonzero(np.abs(null).max(axis=1, initial=0) > 1e-6)[0]

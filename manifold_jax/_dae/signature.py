@@ -1,0 +1,97 @@
+"""Pryce's structural analysis: how often each equation has to be differentiated.
+
+Source: J. D. Pryce, A simple structural analysis method for DAEs, BIT 41 (2001) 364-394.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import maximum_bipartite_matching
+
+
+# In a signature matrix: the unknown does not occur in the equation.
+ABSENT = -(10**6)
+
+
+class Structure(NamedTuple):
+    """A signature matrix `sigma_ij`, the highest derivative of unknown `j` in equation `i`, with
+    the offsets `c_i` (differentiations of equation `i`) and `d_j` (highest derivative of unknown
+    `j` then), the smallest with `d_j - c_i >= sigma_ij`, equal on the transversal."""
+
+    sigma: np.ndarray
+    transversal: np.ndarray  # the unknown that belongs to each equation
+    c: np.ndarray
+    d: np.ndarray
+
+    @property
+    def leading(self) -> np.ndarray:
+        """Where the equations, differentiated `c_i` times, have the derivatives `d_j`."""
+        return self.d[None, :] - self.c[:, None] == self.sigma
+
+    @property
+    def degrees_of_freedom(self) -> int:
+        return int(self.d.sum() - self.c.sum())
+
+    @property
+    def index(self) -> int:
+        """Differentiations until the equations are an ordinary differential equation of all
+        unknowns: one more where an unknown is only found algebraically."""
+        return int(self.c.max(initial=0)) + int((self.d == 0).any())
+
+    @staticmethod
+    def of(sigma: np.ndarray, at_least: np.ndarray | None = None) -> "Structure | None":
+        """`None` if no assignment of unknowns to equations exists. `at_least` are lower bounds of
+        the `c_i`."""
+        n = len(sigma)
+        rows, transversal = linear_sum_assignment(sigma.astype(float), maximize=True)
+        on_transversal = sigma[rows, transversal]
+        if (on_transversal == ABSENT).any():
+            return None
+        c = np.zeros(n, int) if at_least is None else at_least
+        while True:
+            d = (sigma + c[:, None]).max(axis=0, initial=ABSENT)
+            raised = np.maximum(c, d[transversal] - on_transversal)
+            if (raised == c).all():
+                return Structure(sigma, transversal, c, d)
+            c = raised
+
+
+def signature(occurs: np.ndarray) -> np.ndarray:
+    """From `occurs[i, k, j]`: whether the derivative `k` of unknown `j` is in equation `i`."""
+    highest = occurs.shape[1] - 1 - np.argmax(occurs[:, ::-1], axis=1)
+    return np.where(occurs.any(axis=1), highest, ABSENT)
+
+
+class SingularParts(NamedTuple):
+    """Of a matrix without a transversal (Dulmage & Mendelsohn, Canad. J. Math. 10 (1958) 517-534):
+    the equations that have too few unknowns for all of them, and those unknowns; the unknowns that
+    too few equations are left for, and those equations."""
+
+    overdetermined: tuple[np.ndarray, np.ndarray]  # equations, unknowns
+    underdetermined: tuple[np.ndarray, np.ndarray]
+
+    @staticmethod
+    def of(there: np.ndarray) -> "SingularParts":
+        unknown_of = maximum_bipartite_matching(csr_array(there), perm_type="column")
+        equation_of = np.full(there.shape[1], -1)
+        matched = unknown_of >= 0
+        equation_of[unknown_of[matched]] = np.nonzero(matched)[0]
+        over = _reached(there, ~matched, equation_of)
+        under = _reached(there.T, equation_of < 0, unknown_of)
+        return SingularParts(over, (under[1], under[0]))
+
+
+def _reached(
+    there: np.ndarray, start: np.ndarray, back: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """By alternating paths: rows from `start`, to columns, and to the rows these belong to."""
+    rows = start.copy()
+    while True:
+        columns = there[rows].any(axis=0)
+        after = rows.copy()
+        after[back[columns & (back >= 0)]] = True
+        if (after == rows).all():
+            return np.nonzero(rows)[0], np.nonzero(columns)[0]
+        rows = after

@@ -1,0 +1,101 @@
+"""A differential-algebraic equation as a vector field on a manifold."""
+
+from typing import Any
+
+import diffrax as dfx
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from .._constraint_checks import check_state
+from .._custom_types import Args, RealScalarLike, Y
+from .._projection_info import ProjectionInfo
+from .constraint import rate, Reduced, ReducedConstraint, unknowns_with_derivatives
+from .initial import consistent_state, Guess
+from .report import DAEReport
+
+
+class ReducedDAE(eqx.Module):
+    """What [`reduce_dae`][] returns. The state `z` is a vector of shape `(states,)`; the names of
+    its numbers are `report.states`."""
+
+    system: Reduced
+    report: DAEReport = eqx.field(static=True)
+
+    @property
+    def terms(self) -> dfx.ODETerm:
+        """The vector field on the state, a Diffrax term. NaN where the equations do not determine
+        it."""
+        return dfx.ODETerm(self._field)
+
+    @property
+    def constraint(self) -> ReducedConstraint:
+        """The manifold, for [`Projected`][], [`Stabilized`][] and [`LocalCoordinates`][]: what the
+        equations and their derivatives say of the state. Without equations (`num_constraints` of
+        the report is 0) use the solver alone."""
+        return ReducedConstraint(self.system)
+
+    def consistent_state(
+        self,
+        t0: RealScalarLike,
+        x_guess: Y,
+        args: Args = None,
+        *,
+        derivatives: tuple[Y, ...] = (),
+        fixed: Any = (),
+        throw: bool = True,
+    ) -> tuple[Float[Array, " states"], ProjectionInfo]:
+        r"""A state near a guess that satisfies the equations and all that follows from them.
+
+        **Arguments:**
+
+        - `t0`: the time.
+        - `x_guess`: like `x_example`. Of unknowns that are not states (multipliers) the guess does
+            not matter.
+        - `args`: the parameters.
+        - `derivatives`: guesses for `x', x'', ...`, each like `x_guess`, for states that are derivatives
+            without a name of their own; zero if not given.
+        - `fixed`: names of what must not move, of whole arrays (`"q"`, of an array alone `"x"`) or
+            numbers (`"q[0]"`), with `'` for derivatives, as in `report.states`.
+        - `throw`: raise if there is no such state. With `throw=False` look at `info.success`.
+
+        **Returns:**
+
+        `(z, info)`: the state, moved across the manifold no more than necessary (the root of
+        `g(t0, z_guess + W^-1 G^T l) = 0` with `G` at the guess), then unknowns that became states
+        as equations are nonlinear in them, from those; and a [`ProjectionInfo`][]. The derivative
+        with respect to all arguments is exact, however far the guess is.
+
+        **Raises:**
+
+        `ValueError` for names that are not states, a guess unlike `x_example`, and a
+        `RuntimeError` if no state near satisfies the equations, if they cannot be satisfied
+        with what is fixed, or if they do not determine the derivatives at the state found
+        (redundant equations, singular configurations; outside of `jit` it says which).
+        """
+        guess = Guess.of(self.system, x_guess, derivatives, fixed)
+        return consistent_state(self.system, t0, guess, args, throw)
+
+    def outputs(self, t: RealScalarLike, z: Float[Array, " states"], args: Args = None) -> Any:
+        """All unknowns and their derivatives, `(x, x', ...)`, as many as `F` takes, multipliers and
+        other algebraic unknowns included: on the manifold `F(t, *outputs, args) = 0`.
+
+        Of one state; `jax.vmap(dae.outputs, in_axes=(0, 0, None))` of saved ones. Derivatives that
+        are not in the equations are found by differentiating along the solution.
+        """
+        self._check(z)
+        equations = self.system.equations
+        found = unknowns_with_derivatives(self.system, t, z, args, equations.order)
+        return tuple(equations.unravel(x) for x in found)
+
+    def _field(self, t: RealScalarLike, y: Float[Array, " states"], args: Args) -> Array:
+        self._check(y)
+        return rate(self.system, t, y, args)
+
+    def _check(self, z: Any) -> None:
+        check_state(z, "z")
+        if jnp.shape(z) != (len(self.report.states),):
+            raise ValueError(
+                f"The state of a reduced system is a vector of shape ({len(self.report.states)},), with the names in "
+                f"`dae.report.states`; got {jnp.shape(z)}. `dae.consistent_state` makes one from a guess of x."
+            )
