@@ -20,7 +20,7 @@ from diffrax._solution import (
     is_okay as is_okay,  # successful or stopped by an event
     update_result as update_result,  # first failure wins
 )
-from diffrax._term import WrapTerm
+from diffrax._term import WrapTerm as WrapTerm  # negates time
 from equinox.internal import (
     buffer_at_set as buffer_at_set,  # writes in place, also under vmap
     MaybeBuffer as MaybeBuffer,  # an array, or one that a loop writes to in place

@@ -13,9 +13,10 @@ from .._custom_types import Args, RealScalarLike, Y
 from .._interpolation import CorrectedInterpolationFactory
 from .._projection import NewtonProjection
 from .._projection_info import ProjectionInfo
+from .._rejection import result_of_state
 from .._stability import is_stable
 from .._stabilization import AbstractStabilization
-from .advance import conclude, HookState, result_of_state
+from .advance import conclude, HookState
 from .base import AbstractManifoldSolver, check_hook_arguments
 from .execution import execution_of
 from .frame import Frame
