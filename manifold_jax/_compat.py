@@ -20,7 +20,7 @@ from diffrax._solution import (
     is_okay as is_okay,  # successful or stopped by an event
     update_result as update_result,  # first failure wins
 )
-from diffrax._term import WrapTerm as WrapTerm  # negates time
+from diffrax._term import WrapTerm
 from equinox.internal import (
     buffer_at_set as buffer_at_set,  # writes in place, also under vmap
     MaybeBuffer as MaybeBuffer,  # an array, or one that a loop writes to in place
@@ -51,6 +51,11 @@ def directed(terms: PyTree, direction: RealScalarLike) -> PyTree:
     """Terms in the time in which Diffrax integrates, `t * direction`."""
     is_leaf = lambda x: isinstance(x, AbstractTerm) and not isinstance(x, MultiTerm)
     return jtu.tree_map(lambda term: WrapTerm(term, direction), terms, is_leaf=is_leaf)
+
+
+def undirected(terms: PyTree) -> PyTree:
+    """Terms as the user wrote them, if Diffrax has wrapped them."""
+    return terms.term if isinstance(terms, WrapTerm) else terms
 
 
 def nonlinear_failure() -> RESULTS:

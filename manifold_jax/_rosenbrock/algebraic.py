@@ -39,7 +39,7 @@ _FAULTS = (
     "`{y}` does not satisfy the algebraic equations of M y' = f (those that `mass` leaves without y'). Write "
     '`consistent="project"` to have it corrected, or correct it first with `terms.consistent_state(t, y, args)`.',
 )
-NOT_CONSISTENT = 3
+INCONSISTENT = 3
 
 
 class Linearized(NamedTuple):
@@ -132,9 +132,12 @@ def relative_size(change: Float[Array, " n"], x: Float[Array, " n"]) -> FloatSca
 
 
 def is_consistent(x: Float[Array, " n"], linearized: Linearized) -> BoolScalar:
+    return linearized.regular & is_small(relative_size(linearized.newton, x))
+
+
+def is_small(correction: FloatScalar) -> BoolScalar:
     """To half of the digits: what is beside that would have to be a mistake."""
-    size = relative_size(linearized.newton, x)
-    return linearized.regular & (size <= jnp.sqrt(jnp.finfo(x.dtype).eps))
+    return correction <= jnp.sqrt(jnp.finfo(correction.dtype).eps)
 
 
 class _Iterate(NamedTuple):

@@ -67,18 +67,19 @@ class MassMatrixTerm(dfx.AbstractTerm):
         self.vector_field = vector_field
         self.mass = mass
 
-    def vf(self, t: RealScalarLike, y: Y, args: Args) -> NoReturn:
-        raise ValueError(
-            "`terms` is an `mj.MassMatrixTerm`, whose mass matrix this solver would ignore. Use `mj.Rodas5P()` or "
-            "`mj.Rodas3P()`, alone or in `mj.Projected`. For another solver and a regular mass matrix solve for y' in "
-            "the vector field of a `diffrax.ODETerm`."
-        )
+    def vf(self, t: RealScalarLike, y: Y, args: Args) -> Y:
+        return self.vector_field(t, y, args)
 
     def contr(self, t0: RealScalarLike, t1: RealScalarLike, **kwargs: Any) -> RealScalarLike:
         return t1 - t0
 
     def prod(self, vf: Any, control: RealScalarLike) -> NoReturn:
-        return self.vf(control, vf, None)
+        """What solvers that do not know of mass matrices add to the state."""
+        raise ValueError(
+            "`terms` is an `mj.MassMatrixTerm`, whose mass matrix this solver would ignore. Use `mj.Rodas5P()` or "
+            "`mj.Rodas3P()`, alone or in `mj.Projected`. For another solver and a regular mass matrix solve for y' in "
+            "the vector field of a `diffrax.ODETerm`."
+        )
 
     def consistent_state(
         self, t: RealScalarLike, y: Y, args: Args = None, *, throw: bool = True

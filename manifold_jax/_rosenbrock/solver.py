@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from diffrax import RESULTS
 from jaxtyping import Array, Float
 
-from .._compat import is_okay, is_sde, nonlinear_failure, time_direction
+from .._compat import is_okay, is_sde, nonlinear_failure, time_direction, undirected
 from .._constraint_checks import check_state
 from .._custom_types import Args, BoolScalar, FloatScalar, RealScalarLike, Y
 from .._rejection import is_repeatable, rejecting
@@ -93,20 +93,61 @@ class AbstractRosenbrock(dfx.AbstractAdaptiveSolver):
 
 
 class Rodas5P(AbstractRosenbrock):
-    """Rosenbrock method of order 5 (embedded 4, dense output 4) with eight stages, for stiff
-    equations and DAEs of index 1: L-stable and stiffly accurate."""
+    r"""Rosenbrock method of order 5 (error estimate and dense output of order 4) with eight stages,
+    for stiff ODEs and, with a [`MassMatrixTerm`][], differential-algebraic equations of
+    index 1. Stiffly accurate and L-stable.
+
+    Each step evaluates the exact Jacobian once (forward mode, also by time), factors one matrix
+    $M/\gamma - h\, \partial f/\partial y$ and solves with it once per stage: nothing is
+    iterated. Small systems are solved by written-out arithmetic, without LAPACK.
+
+    Works as any solver of Diffrax: with `diffrax.diffeqsolve` and [`mj.diffeqsolve`][],
+    forwards and backwards in time, in [`Projected`][] (also with a mass matrix),
+    [`LocalCoordinates`][] and [`Stabilized`][] (without one). All adjoints work; derivatives
+    are those of the steps, second derivatives of `f` included.
+
+    Order 5 is kept for non-autonomous equations, for `M y' = f` with constant or regular
+    `M(t, y)` and for DAEs of index 1 with constant `M`; with a singular `M` that depends on time or
+    state it is 3. For very stiff equations with a forcing that stiff components follow (Prothero &
+    Robinson) errors fall as `h^3` to `h^4` while `h` is long against the fast times, not as `h^5`:
+    the conditions against such a reduction are fulfilled partly.
+
+    Prefer [`Rodas3P`][] for tolerances of 1e-3 and above, `diffrax.Kvaerno5()` where the Jacobian is
+    far more expensive than the vector field, `diffrax.Tsit5()` where nothing is stiff.
+
+    **Raises:**
+
+    `ValueError` for terms with noise or controls. At run time `RESULTS.nonlinear_divergence`
+    where the matrix is singular at all step sizes, or the initial value is not consistent (see
+    [`MassMatrixTerm`][]), and `RESULTS.nonfinite` where `f` is not finite at an accepted state.
+
+    Source: Steinebach, BIT Numer. Math. 63:27 (2023); coefficients as published there, dense output
+    included. Hairer & Wanner, Solving ODEs II, IV.7 and VI.4 (methods and their implementation).
+    """
 
     tableau: ClassVar[RosenbrockTableau] = RODAS5P
     checks_start: bool = True
 
 
 class Rodas3P(AbstractRosenbrock):
-    """Rosenbrock method of order 3 (embedded 2, dense output 3)."""
+    """Rosenbrock method of order 3 (error estimate of order 2, dense output 3) with five stages and
+    three evaluations of the vector field, for loose tolerances; all else as [`Rodas5P`][].
+
+    For DAEs of index 1, singular mass matrices that depend on the state included, order 3.
+
+    Source: Steinebach, Rosenbrock methods within OrdinaryDiffEq.jl - Overview, recent developments
+    and applications, Proc. JuliaCon Conf. (2024).
+    """
 
     tableau: ClassVar[RosenbrockTableau] = RODAS3P
     checks_start: bool = True
 
 
 def _check_terms(terms: Any) -> None:
-    if is_sde(terms):
-        raise ValueError("`terms` has noise, which Rosenbrock methods are not for.")
+    is_control = lambda x: isinstance(x, dfx.ControlTerm)
+    leaves = jtu.tree_leaves(undirected(terms), is_leaf=is_control)
+    if is_sde(terms) or any(is_control(leaf) for leaf in leaves):
+        raise ValueError(
+            "`terms` has noise or a control, which Rosenbrock methods are not for: they need df/dt. Of a smooth control "
+            "make an ODE, `diffrax.ControlTerm(f, control).to_ode()`."
+        )

@@ -8,7 +8,7 @@ import jax.flatten_util as jfu
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._compat import directed, time_direction, WrapTerm
+from .._compat import directed, time_direction, undirected
 from .._custom_types import Args, RealScalarLike, Y
 from .mass_matrix import mass_values, MassMatrixTerm, product, ravelled_like
 
@@ -96,5 +96,5 @@ class System(NamedTuple):
 
 def mass_matrix_term(terms: Any) -> MassMatrixTerm | None:
     """That of an equation with a mass matrix, also if time is negated."""
-    inner = terms.term if isinstance(terms, WrapTerm) else terms
+    inner = undirected(terms)
     return inner if isinstance(inner, MassMatrixTerm) else None

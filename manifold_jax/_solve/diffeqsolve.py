@@ -11,6 +11,7 @@ from .._errors import clear_errors
 from .._solver.base import AbstractManifoldSolver
 from .arguments import check_arguments, raise_if_unstable
 from .finish import finish
+from .mass_matrix import trusting
 from .output import events_in_true_time, on_manifold_saving
 from .prepare import prepare
 from .start import Consistent
@@ -110,12 +111,13 @@ def diffeqsolve(
             args,
             saveat,
             throw,
+            consistent,
             event=event,
             solver_state=solver_state,
             **options,
         )
     bends_interpolant = event is not None  # every interpolated value is corrected otherwise
-    solver = solver.within(stepsize_controller, bends_interpolant)
+    solver = trusting(solver.within(stepsize_controller, bends_interpolant), consistent)
     ready = prepare(
         terms, solver, t0, t1, dt0, y0, args, saveat, stepsize_controller, consistent, throw
     )
