@@ -7,6 +7,7 @@ import diffrax as dfx
 import equinox as eqx
 import jax.flatten_util as jfu
 import jax.numpy as jnp
+import jax.tree_util as jtu
 from diffrax import RESULTS
 from jaxtyping import Array, Float
 
@@ -109,8 +110,8 @@ class Rodas5P(AbstractRosenbrock):
     Order 5 is kept for non-autonomous equations, for `M y' = f` with constant or regular
     `M(t, y)` and for DAEs of index 1 with constant `M`; with a singular `M` that depends on time or
     state it is 3. For very stiff equations with a forcing that stiff components follow (Prothero &
-    Robinson) errors fall as `h^3` to `h^4` while `h` is long against the fast times, not as `h^5`:
-    the conditions against such a reduction are fulfilled partly.
+    Robinson) errors fall with a lower power of `h` while `h` is long against the fast times: the
+    conditions against this reduction of the order are fulfilled up to 4, not 5.
 
     Prefer [`Rodas3P`][] for tolerances of 1e-3 and above, `diffrax.Kvaerno5()` where the Jacobian is
     far more expensive than the vector field, `diffrax.Tsit5()` where nothing is stiff.
@@ -133,7 +134,8 @@ class Rodas3P(AbstractRosenbrock):
     """Rosenbrock method of order 3 (error estimate of order 2, dense output 3) with five stages and
     three evaluations of the vector field, for loose tolerances; all else as [`Rodas5P`][].
 
-    For DAEs of index 1, singular mass matrices that depend on the state included, order 3.
+    Order 3 is kept as order 5 is by [`Rodas5P`][]; with a singular `M` that depends on time or
+    state it is 2.
 
     Source: Steinebach, Rosenbrock methods within OrdinaryDiffEq.jl - Overview, recent developments
     and applications, Proc. JuliaCon Conf. (2024).

@@ -85,10 +85,9 @@ def _iteration_matrix(
     M: Float[Array, "..."] | None, gamma: float, J: Float[Array, "n n"]
 ) -> Float[Array, "n n"]:
     """`M / gamma - J`."""
-    if M is not None and M.ndim == 2:
-        return M / gamma - J
-    eye = jnp.eye(J.shape[0], dtype=J.dtype)
-    return (eye / gamma if M is None else eye * (M / gamma)) - J
+    n = J.shape[0]
+    M = jnp.ones((), J.dtype) if M is None else M
+    return (M if M.ndim == 2 else jnp.diag(jnp.broadcast_to(M, (n,)))) / gamma - J
 
 
 def _without_zeros(row: Row) -> Row:
