@@ -14,7 +14,7 @@ README = Path(__file__).parents[1] / "README.md"
 BLOCKS = re.findall(r"```python\n(.*?)```", README.read_text(), flags=re.DOTALL)
 # What the others need of the first one, as the text says: the imports and the setting.
 PREAMBLE = BLOCKS[0].split("\n\n\n")[0]
-NAMES = ["fifteen lines", "mechanism", "curves and minima", "fit", "ensemble", "extend"]
+NAMES = ["fifteen lines", "mechanism", "stiff", "curves and minima", "fit", "ensemble", "extend"]
 
 
 def run(*blocks):
@@ -37,6 +37,12 @@ def check_mechanism(namespace):
     q = np.asarray(namespace["motion"].ys[0][-1])
     np.testing.assert_allclose(np.linalg.norm([q[0], q[1] - q[0]], axis=1), 1, atol=1e-15)
     assert namespace["forces"].shape == (2,)
+
+
+def check_stiff(namespace):
+    """Test Set for IVP Solvers (Mazzia & Magherini 2008), II-10."""
+    end = [0.2083340149701255e-07, 0.8333360770334713e-13, 0.9999999791665050]
+    np.testing.assert_allclose(namespace["stiff"].ys[0], end, rtol=1e-7)
 
 
 def check_curves_and_minima(namespace):
@@ -72,6 +78,7 @@ def check_extend(namespace):
 CHECKS = (
     check_fifteen_lines,
     check_mechanism,
+    check_stiff,
     check_curves_and_minima,
     check_fit,
     check_ensemble,
