@@ -32,8 +32,8 @@ def robertson_dae(np_: Any) -> Callable:
     """With the balance in place of the third equation."""
 
     def field(t, y, rates):
-        first, second, _ = robertson(np_)(t, y, rates)
-        return np_.stack([first, second, y[0] + y[1] + y[2] - 1])
+        change = robertson(np_)(t, y, rates)
+        return np_.stack([change[0], change[1], y[0] + y[1] + y[2] - 1])
 
     return field
 

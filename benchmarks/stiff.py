@@ -124,7 +124,9 @@ def measure_problem(name: str, problem: StiffProblem, repeats: int, console: Con
     for method, run in runs.items():
         end, steps, success = run()
         found = digits(problem, end) if success else None
-        rows.append(Row(name, method, None if steps is None else int(steps), found, timings[method]))
+        rows.append(
+            Row(name, method, None if steps is None else int(steps), found, timings[method])
+        )
     return rows
 
 
