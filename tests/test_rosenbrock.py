@@ -158,6 +158,24 @@ def test_orders(name, case, order, steps):
     assert abs(np.log2(errors[0] / errors[1]) - order) <= 0.2, errors
 
 
+@pytest.mark.parametrize(("name", "order"), [("Rodas5P", 3), ("Rodas3P", 2)])
+def test_order_of_fast_components(name, order):
+    """The reduction that the docstrings state, and that it is divided by the stiffness."""
+    follow = lambda t, y, rate: -rate * (y - jnp.sin(t)) + jnp.cos(t)
+
+    @jax.jit
+    def error(n, rate):
+        y0, saveat = jnp.sin(jnp.zeros(1)), dfx.SaveAt(steps=True)
+        terms, solver = dfx.ODETerm(follow), METHODS[name]
+        options = dict(args=rate, saveat=saveat, max_steps=64, throw=False)
+        sol = dfx.diffeqsolve(terms, solver, 0.0, 2.0, 2 / n, y0, **options)
+        error = jnp.abs(sol.ys[:, 0] - jnp.sin(sol.ts))
+        return jnp.max(jnp.where(jnp.isfinite(sol.ts), error, 0))
+
+    assert abs(np.log2(error(8.0, 1e6) / error(16.0, 1e6)) - order) <= 0.2
+    assert abs(error(8.0, 1e5) / error(8.0, 1e6) - 10) <= 1
+
+
 # --- published solutions --------------------------------------------------------------------------
 
 

@@ -109,9 +109,9 @@ class Rodas5P(AbstractRosenbrock):
 
     Order 5 is kept for non-autonomous equations, for `M y' = f` with constant or regular
     `M(t, y)` and for DAEs of index 1 with constant `M`; with a singular `M` that depends on time or
-    state it is 3. For very stiff equations with a forcing that stiff components follow (Prothero &
-    Robinson) errors fall with a lower power of `h` while `h` is long against the fast times: the
-    conditions against this reduction of the order are fulfilled up to 4, not 5.
+    state it is 3. Fast components that follow a forcing, $y' = \lambda (y - \varphi(t)) +
+    \varphi'(t)$ (Prothero & Robinson), have errors of order $h^3 / |\lambda|$ while
+    $h |\lambda| \gg 1$, where the stage order shows, and $h^5$ below.
 
     Prefer [`Rodas3P`][] for tolerances of 1e-3 and above, `diffrax.Kvaerno5()` where the Jacobian is
     far more expensive than the vector field, `diffrax.Tsit5()` where nothing is stiff.
@@ -131,11 +131,11 @@ class Rodas5P(AbstractRosenbrock):
 
 
 class Rodas3P(AbstractRosenbrock):
-    """Rosenbrock method of order 3 (error estimate of order 2, dense output 3) with five stages and
+    r"""Rosenbrock method of order 3 (error estimate of order 2, dense output 3) with five stages and
     three evaluations of the vector field, for loose tolerances; all else as [`Rodas5P`][].
 
     Order 3 is kept as order 5 is by [`Rodas5P`][]; with a singular `M` that depends on time or
-    state it is 2.
+    state it is 2. Fast components that follow a forcing have errors of order $h^2 / |\lambda|$.
 
     Source: Steinebach, Rosenbrock methods within OrdinaryDiffEq.jl - Overview, recent developments
     and applications, Proc. JuliaCon Conf. (2024).

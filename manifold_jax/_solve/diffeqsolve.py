@@ -52,10 +52,13 @@ def diffeqsolve(
 
     - `solver`: [`Projected`][] or another solver of this library. (Any other Diffrax solver
         is passed on, for comparisons; implicit stages are solved to round-off there, too.)
+        [`Rodas5P`][] and [`Rodas3P`][], alone or wrapped, for stiff equations; they take a
+        [`MassMatrixTerm`][].
     - `dt0`: `None` with an adaptive controller chooses the first step from the vector field
         (Hairer, Norsett & Wanner, Solving ODEs I, II.4).
     - `consistent`: what to do with `y0`. `"project"` moves it onto the manifold, `"check"`
-        refuses it if it is not there (to `tolerance`), `"assume"` trusts it.
+        refuses it if it is not there (to `tolerance`), `"assume"` trusts it. The same for the
+        algebraic equations of a [`MassMatrixTerm`][], which is checked to half of the digits.
     - `event`: event functions get the true time, also when integrating backwards. With a root
         finder the earliest event ends the solve, whatever the order of `cond_fn`.
     - `adjoint`: how derivatives are computed, by default in reverse mode by
