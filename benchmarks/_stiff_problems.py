@@ -3,7 +3,11 @@
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
+from scipy.integrate import solve_ivp
+
+import manifold_jax as mj
 
 
 class StiffProblem(NamedTuple):
@@ -145,3 +149,40 @@ PROBLEMS = {
         1e-10,
     ),
 }
+
+
+# A stiff mechanism: a bead at the end of a rod of length 1, and another one tied to it by a hard
+# spring with a damper, of rest length 1. Its fast times are 1e-5 and 1e-3.
+STIFFNESS, DAMPING, GRAVITY = 1e8, 1e5, 9.81
+MECHANISM_START = np.array([[1.0, 0.0], [2.0, 0.0]])
+
+
+def pull(np_: Any, q: Any, v: Any) -> Any:
+    """The force on the first bead."""
+    gap, rate = q[1] - q[0], v[1] - v[0]
+    length = np_.sqrt(gap @ gap)
+    along = gap / length
+    return (STIFFNESS * (length - 1) + DAMPING * (rate @ along)) * along
+
+
+def stiff_mechanism() -> mj.MechanicalSystem:
+    def force(t, q, v, args):
+        F = pull(jnp, q, v)
+        return jnp.stack([F, -F]) - jnp.array([[0.0, GRAVITY]])
+
+    return mj.MechanicalSystem(1.0, lambda t, q, args: q[0] @ q[0] - 1, force)
+
+
+def stiff_mechanism_reference(t1: float) -> np.ndarray:
+    """Both positions, in the angle of the rod and the coordinates of the other bead, by SciPy."""
+
+    def field(t, y):
+        normal = np.array([-np.sin(y[0]), np.cos(y[0])])
+        radial, speed = np.array([np.cos(y[0]), np.sin(y[0])]), y[1]
+        q, v = np.stack([radial, y[2:4]]), np.stack([speed * normal, y[4:6]])
+        F, weight = pull(np, q, v), np.array([0.0, -GRAVITY])
+        return np.array([speed, (F + weight) @ normal, *v[1], *(weight - F)])
+
+    start = [0.0, 0.0, *MECHANISM_START[1], 0.0, 0.0]
+    y = solve_ivp(field, (0.0, t1), start, method="Radau", rtol=1e-11, atol=1e-12).y[:, -1]
+    return np.array([[np.cos(y[0]), np.sin(y[0])], y[2:4]])

@@ -36,7 +36,13 @@ from ._measure import (
     write_json,
 )
 from ._stiff_peers import peers
-from ._stiff_problems import PROBLEMS, StiffProblem
+from ._stiff_problems import (
+    MECHANISM_START,
+    PROBLEMS,
+    stiff_mechanism,
+    stiff_mechanism_reference,
+    StiffProblem,
+)
 
 
 METHODS = {
@@ -130,6 +136,32 @@ def measure_problem(name: str, problem: StiffProblem, repeats: int, console: Con
     return rows
 
 
+def measure_mechanism(repeats: int) -> list[Row]:
+    """On its manifold; the digits are absolute ones of the positions."""
+    system, t1 = stiff_mechanism(), 0.5
+    reference = stiff_mechanism_reference(t1)
+    start = jnp.asarray(MECHANISM_START), jnp.zeros((2, 2))
+    controller = dfx.PIDController(rtol=1e-8, atol=1e-8)
+    runs = {}
+    for method, solver in {**METHODS, "Tsit5 (Diffrax)": dfx.Tsit5()}.items():
+        hook = mj.Projected(solver, system.constraint)
+        options = dict(stepsize_controller=controller, max_steps=MAX_STEPS * 20, throw=False)
+        run = lambda y0, hook=hook, options=options: mj.diffeqsolve(
+            system.terms, hook, 0.0, t1, 1e-6, y0, **options
+        )
+        last = lambda y0, run=run: (
+            lambda sol: (sol.ys[0][0], sol.stats["num_steps"], sol.result == dfx.RESULTS.successful)
+        )(run(y0))
+        runs[f"projected {method}"], _ = compiled(last, start)
+    timings = interleaved(runs, repeats)
+    rows = []
+    for method, run in runs.items():
+        q, steps, success = run()
+        found = float(-np.log10(np.max(np.abs(q - reference)))) if success else None
+        rows.append(Row("stiff mechanism", method, int(steps), found, timings[method]))
+    return rows
+
+
 def measure_batch(size: int, repeats: int) -> list[BatchRow]:
     problem = PROBLEMS["Robertson"]
     spread = np.random.default_rng(0).uniform(-1, 1, (size, 3))
@@ -172,6 +204,7 @@ def main(
     rows = []
     for name, problem in PROBLEMS.items():
         rows += measure_problem(name, problem, repeats, console)
+    rows += measure_mechanism(repeats)
     batch = measure_batch(trajectories, min(repeats, 3))
     print_tables(console, rows, batch)
     if json is not None:

@@ -10,7 +10,12 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
 import manifold_jax as mj
-from benchmarks._stiff_problems import PROBLEMS
+from benchmarks._stiff_problems import (
+    MECHANISM_START,
+    PROBLEMS,
+    stiff_mechanism,
+    stiff_mechanism_reference,
+)
 
 
 METHODS = {"Rodas5P": mj.Rodas5P(), "Rodas3P": mj.Rodas3P()}
@@ -442,6 +447,25 @@ def test_steps_in_diffrax_end_where_the_interpolant_does():
     np.testing.assert_array_equal(inside.evaluate(1e-4), y1)
     np.testing.assert_array_equal(inside.evaluate(0.0), y0)
     assert abs(jnp.sum(y1) - 1) < 3e-16
+
+
+@pytest.mark.slow
+def test_stiff_mechanism():
+    """A hard spring: Tsit5 takes 1e5 steps."""
+    system = stiff_mechanism()
+    sol = mj.diffeqsolve(
+        system.terms,
+        mj.Projected(mj.Rodas5P(), system.constraint),
+        0.0,
+        0.5,
+        1e-6,
+        (jnp.asarray(MECHANISM_START), jnp.zeros((2, 2))),
+        stepsize_controller=dfx.PIDController(rtol=1e-8, atol=1e-8),
+    )
+    q, _ = sol.ys
+    np.testing.assert_allclose(q[0], stiff_mechanism_reference(0.5), rtol=0, atol=1e-7)
+    assert sol.stats["num_steps"] < 1000
+    assert abs(q[0, 0] @ q[0, 0] - 1) < 1e-15
 
 
 @pytest.mark.parametrize(
