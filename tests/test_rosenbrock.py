@@ -451,7 +451,7 @@ def test_steps_in_diffrax_end_where_the_interpolant_does():
 
 @pytest.mark.slow
 def test_stiff_mechanism():
-    """A hard spring: Tsit5 takes 1e5 steps."""
+    """A hard spring: Tsit5 takes 2e4 steps."""
     system = stiff_mechanism()
     sol = mj.diffeqsolve(
         system.terms,

@@ -1,6 +1,6 @@
 """The stages of a Rosenbrock step."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -37,46 +37,39 @@ def rosenbrock_step(
     Source: Hairer & Wanner, Solving ODEs II, VI.4 and VI.6; Lubich & Roche, Computing 43 (1990)
     325-342.
     """
-    carries = derivative is not None
     h = system.step.astype(x0.dtype)
-    Z0 = h * derivative if carries else None
+    Z0 = None if derivative is None else h * derivative
     f0, J, T = system.linearized(x0, Z0)
     M0 = system.mass_at(system.t0, x0)
     factor = factorize_pivoted(_iteration_matrix(M0, tableau.gamma, J))
     U: list[Vector] = []
     V: list[Vector] = []
-    known = {((), 0.0): (x0, f0, M0)}
-    for i in range(len(tableau.c)):
+    known = {((), 0.0): (f0, M0)}
+    for i, c in enumerate(tableau.c):
         row = _without_zeros(tableau.a_lower[i - 1] if i > 0 else ())
-        at = row, tableau.c[i]
-        if at not in known:
-            t, x = system.time(tableau.c[i]), x0 + _combination(row, U)
-            known[at] = x, system.increment(t, x), system.mass_at(t, x) if carries else M0
-        _, f, M = known[at]
-        right = f
-        coupling = _combination(tableau.c_lower[i - 1], U) if i > 0 else None
+        if (row, c) not in known:  # some methods have stages at the same point
+            t, x = system.time(c), _plus(x0, row, U)
+            known[row, c] = system.increment(t, x), M0 if Z0 is None else system.mass_at(t, x)
+        f, M = known[row, c]
+        coupling = _plus(None, tableau.c_lower[i - 1] if i > 0 else (), U)
+        right = f if tableau.d[i] == 0 else f + tableau.d[i] * T
         if coupling is not None:
             right = right + (coupling if M0 is None else product(M0, coupling))
-        if tableau.d[i] != 0:
-            right = right + tableau.d[i] * T
-        Z = None
-        if carries:
-            Z = Z0 + _combination(row, V) if row else Z0
-            right = right - product(M - M0, Z)
-        U.append(factor.solve(right))
-        if carries:
-            V.append(U[i] / tableau.gamma - Z - (0 if coupling is None else coupling))
-    defined = jnp.all(jnp.isfinite(f0)) & jnp.all(jnp.isfinite(J)) & jnp.all(jnp.isfinite(T))
+        if Z0 is None:
+            U.append(factor.solve(right))
+            continue
+        Z = _plus(Z0, row, V)
+        U.append(factor.solve(right - product(M - M0, Z)))
+        V.append(U[i] / tableau.gamma - Z - (0 if coupling is None else coupling))
+    finite = [jnp.all(jnp.isfinite(value)) for value in (f0, J, T)]
     # A finished lane of a batch makes steps of no length.
-    after = None
-    if carries:
-        after = (Z0 + _combination(tableau.m, V)) / jnp.where(h == 0, 1, h)
+    after = None if Z0 is None else _plus(Z0, tableau.m, V) / jnp.where(h == 0, 1, h)
     return RosenbrockStep(
-        x0 + _combination(tableau.m, U),
-        _combination(tableau.error, U),
-        tuple(_combination(row, U) for row in tableau.dense),
+        _plus(x0, tableau.m, U),
+        _plus(None, tableau.error, U),
+        tuple(_plus(None, weights, U) for weights in tableau.dense),
         after,
-        defined,
+        finite[0] & finite[1] & finite[2],
         factor.regular,
     )
 
@@ -97,10 +90,11 @@ def _without_zeros(row: Row) -> Row:
     return row
 
 
-def _combination(row: Row, vectors: list[Vector]) -> Vector:
-    """Of those with a coefficient, as many as there are."""
-    parts = [c * v if c != 1 else v for c, v in zip(row, vectors, strict=False) if c != 0]
-    total = parts[0]
-    for part in parts[1:]:
-        total = total + part
+def _plus(start: Vector | None, row: Row, vectors: list[Vector]) -> Any:
+    """`start` and the combination of those vectors that have a coefficient."""
+    total = start
+    for c, v in zip(row, vectors, strict=False):
+        if c != 0:
+            part = v if c == 1 else c * v
+            total = part if total is None else total + part
     return total
