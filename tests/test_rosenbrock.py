@@ -276,6 +276,31 @@ def test_gradients_agree_where_the_mass_depends_on_the_state():
 
 
 @pytest.mark.slow
+def test_gradients_of_a_batch():
+    """Lanes that end early make steps of no length, with a singular matrix."""
+
+    def end(start, t1):
+        y0 = {"x": start[None], "w": jnp.zeros(())}
+        sol = mj.diffeqsolve(
+            mj.MassMatrixTerm(curved, constant_mass(PARAMETERS)),
+            mj.Rodas3P(),
+            0.0,
+            t1,
+            None,
+            y0,
+            PARAMETERS,
+            stepsize_controller=dfx.PIDController(rtol=1e-6, atol=1e-6),
+        )
+        return sol.ys["x"][0, 0]
+
+    starts, times = jnp.array([0.8, 0.5, 1.2]), jnp.array([0.1, 3.0, 1.0])
+    gradient = jax.jit(jax.grad(end))
+    batch = jax.jit(jax.vmap(gradient))(starts, times)
+    alone = [gradient(start, t1) for start, t1 in zip(starts, times)]
+    np.testing.assert_allclose(batch, jnp.stack(alone), rtol=1e-11)
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("adjoint", [dfx.RecursiveCheckpointAdjoint(), dfx.DirectAdjoint()])
 def test_gradients_of_diffrax_agree(adjoint):
     gradient = lambda adjoint: jax.grad(end_of_curved)(PARAMETERS, adjoint)
@@ -536,6 +561,7 @@ def test_index_two():
     failed = solve_dae(jnp.array([0.0, 1.0]), field, mass, throw=False)
     assert failed.result == RESULTS.nonlinear_divergence
     assert not np.isfinite(failed.ys).any()
+    assert failed.stats["num_steps"] == 1  # no smaller step helps
     with pytest.raises(RuntimeError, match="consistent"):
         solve_dae(START, lambda t, y, args: y[:1] ** 2 + jnp.ones(2), 0.0)
 
