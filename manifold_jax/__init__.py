@@ -41,6 +41,11 @@ from ._mechanics import (
 from ._project import consistent_state as consistent_state, project as project
 from ._projection import NewtonProjection as NewtonProjection
 from ._projection_info import ProjectionInfo as ProjectionInfo
+from ._rosenbrock import (
+    MassMatrixTerm as MassMatrixTerm,
+    Rodas3P as Rodas3P,
+    Rodas5P as Rodas5P,
+)
 from ._solve import diffeqsolve as diffeqsolve
 from ._solver import (
     LocalCoordinates as LocalCoordinates,

@@ -53,6 +53,11 @@ def directed(terms: PyTree, direction: RealScalarLike) -> PyTree:
     return jtu.tree_map(lambda term: WrapTerm(term, direction), terms, is_leaf=is_leaf)
 
 
+def undirected(terms: PyTree) -> PyTree:
+    """Terms as the user wrote them, if Diffrax has wrapped them."""
+    return terms.term if isinstance(terms, WrapTerm) else terms
+
+
 def nonlinear_failure() -> RESULTS:
     """The result code of a constraint that could not be satisfied.
 

@@ -15,7 +15,7 @@ PACKAGE = Path(mj.__file__).parent
 FILES = sorted(PACKAGE.rglob("*.py"))
 # Layers, lowest first; a file may import from its own layer or a lower one.
 LAYERS = [
-    {"_custom_types", "_compat", "_errors", "_user_function"},
+    {"_custom_types", "_compat", "_errors", "_user_function", "_rejection"},
     {"_linear", "_residual", "_projection", "_stability", "_directed_term", "_scalar"},
     {"_newton"},
     {"_correction"},
@@ -25,6 +25,7 @@ LAYERS = [
     {"_violation", "_diagnosis"},
     {"_project"},
     {"_chart", "_stabilization", "_interpolation"},
+    {"_rosenbrock"},
     {"_tangent", "_solver"},
     {"_adjoint"},
     {"_solve"},

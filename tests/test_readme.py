@@ -18,6 +18,7 @@ NAMES = [
     "fifteen lines",
     "mechanism",
     "dae",
+    "stiff",
     "curves and minima",
     "fit",
     "ensemble",
@@ -62,6 +63,12 @@ def check_dae(namespace):
     np.testing.assert_allclose(x["drive"], both, rtol=0, atol=1e-12)
     np.testing.assert_allclose(xdot["speed"], -np.sin(t), rtol=0, atol=1e-12)
     assert namespace["dae"].report.index == 3
+
+
+def check_stiff(namespace):
+    """Test Set for IVP Solvers (Mazzia & Magherini 2008), II-10."""
+    end = [0.2083340149701255e-07, 0.8333360770334713e-13, 0.9999999791665050]
+    np.testing.assert_allclose(namespace["stiff"].ys[0], end, rtol=1e-7)
 
 
 def check_curves_and_minima(namespace):
@@ -110,6 +117,7 @@ CHECKS = (
     check_fifteen_lines,
     check_mechanism,
     check_dae,
+    check_stiff,
     check_curves_and_minima,
     check_fit,
     check_ensemble,

@@ -11,6 +11,7 @@ from .._errors import clear_errors
 from .._solver.base import AbstractManifoldSolver
 from .arguments import check_arguments, raise_if_unstable
 from .finish import finish
+from .mass_matrix import trusting
 from .output import events_in_true_time, on_manifold_saving
 from .prepare import prepare
 from .start import Consistent
@@ -51,10 +52,13 @@ def diffeqsolve(
 
     - `solver`: [`Projected`][] or another solver of this library. (Any other Diffrax solver
         is passed on, for comparisons; implicit stages are solved to round-off there, too.)
+        [`Rodas5P`][] and [`Rodas3P`][], alone or wrapped, for stiff equations; they take a
+        [`MassMatrixTerm`][].
     - `dt0`: `None` with an adaptive controller chooses the first step from the vector field
         (Hairer, Norsett & Wanner, Solving ODEs I, II.4).
     - `consistent`: what to do with `y0`. `"project"` moves it onto the manifold, `"check"`
-        refuses it if it is not there (to `tolerance`), `"assume"` trusts it.
+        refuses it if it is not there (to `tolerance`), `"assume"` trusts it. The same for the
+        algebraic equations of a [`MassMatrixTerm`][], which is checked to half of the digits.
     - `event`: event functions get the true time, also when integrating backwards. With a root
         finder the earliest event ends the solve, whatever the order of `cond_fn`.
     - `adjoint`: how derivatives are computed, by default in reverse mode by
@@ -110,12 +114,13 @@ def diffeqsolve(
             args,
             saveat,
             throw,
+            consistent,
             event=event,
             solver_state=solver_state,
             **options,
         )
     bends_interpolant = event is not None  # every interpolated value is corrected otherwise
-    solver = solver.within(stepsize_controller, bends_interpolant)
+    solver = trusting(solver.within(stepsize_controller, bends_interpolant), consistent)
     ready = prepare(
         terms, solver, t0, t1, dt0, y0, args, saveat, stepsize_controller, consistent, throw
     )

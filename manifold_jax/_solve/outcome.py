@@ -12,6 +12,7 @@ from jaxtyping import Array
 from .._compat import messages_of_results, nonlinear_failure, number_of_result, save_y
 from .._custom_types import BoolScalar, IntScalar
 from .._projection import NewtonProjection
+from .._rosenbrock import AbstractRosenbrock
 from .._solver import Projected
 from .._solver.advance import StepStatistics
 from .._solver.base import AbstractManifoldSolver
@@ -29,6 +30,11 @@ _TOO_LONG = (
 _NOT_FINITE = (
     "The state is not finite (NaN or infinite) from some time on: the vector field is not defined on the way. For an "
     "`mj.MechanicalSystem` the mass matrix is not positive definite there, or constraints depend on each other."
+)
+_SINGULAR = (
+    "A step could not be made: `y0` does not satisfy the algebraic equations (see "
+    "`mj.MassMatrixTerm.consistent_state`), or the matrix M - h gamma df/dy is singular or not finite, as where the index "
+    "of M y' = f is above 1 (reduce it, for example with `mj.reduce_dae`)."
 )
 _NOT_TANGENT = (
     "The maximum number of solver steps was reached, and the corrections undid a large part of every step: the vector "
@@ -66,6 +72,13 @@ def fault_messages(
         undone = _undo_steps(statistics, num_accepted_steps, solver.projection)
         faults.append((undone & (result == RESULTS.max_steps_reached), _NOT_TANGENT))
     return faults
+
+
+def alone_messages(result: RESULTS, solver: dfx.AbstractSolver) -> list[tuple[BoolScalar, str]]:
+    """The same for a solver without a hook."""
+    if not isinstance(solver, AbstractRosenbrock):
+        return []
+    return [(result == nonlinear_failure(), _SINGULAR)]
 
 
 def _undo_steps(

@@ -11,11 +11,13 @@ from jaxtyping import Array
 from .._constraint_checks import check_constraint, check_state
 from .._custom_types import Args, RealScalarLike, Y
 from .._directed_term import DirectedTerm
+from .._rosenbrock import MassMatrixTerm
 from .._solver import Stabilized
 from .._solver.advance import HookState
 from .._solver.base import AbstractManifoldSolver, controller_tolerances
 from .._solver.execution import execution_of, WrittenOut
 from .first_step import first_step, FirstStep
+from .mass_matrix import consistent_with_mass
 from .start import Consistent, start_state, StartInfo
 
 
@@ -46,12 +48,13 @@ def prepare(
 ) -> Ready:
     """`controller` chooses the first step if `dt0` is None."""
     dtype = time_dtype(t0, t1, dt0, saveat)
-    y0 = _as_state(y0, dtype)
+    y0 = as_state(y0, dtype)
     t0, t1 = jnp.asarray(t0, dtype), jnp.asarray(t1, dtype)
     check_constraint(solver.constraint, t0, y0, args)
+    y0, _ = consistent_with_mass(terms, t0, y0, args, consistent, throw)
     y0, start = start_state(solver.constraint, t0, y0, args, solver.projection, consistent, throw)
     solver_state = None
-    if dt0 is None and (first := _first_step(terms, solver, t0, t1, y0, args, controller)):
+    if dt0 is None and (first := chosen_first_step(terms, solver, t0, t1, y0, args, controller)):
         dt0 = first.size
         solver_state = _solver_state(terms, solver, t0, y0, args, first)
     return Ready(t0, t1, dt0, y0, solver_state, start)
@@ -66,14 +69,16 @@ def time_dtype(t0: Any, t1: Any, dt0: Any, saveat: dfx.SaveAt) -> Any:
         return dtype if jnp.issubdtype(dtype, jnp.floating) else jnp.result_type(float)
 
 
-def _as_state(y0: Y, dtype: Any) -> Y:
+def as_state(y0: Y, dtype: Any) -> Y:
     check_state(y0, "y0")
     with jax.numpy_dtype_promotion("standard"):
         return jtu.tree_map(lambda leaf: jnp.asarray(leaf, jnp.result_type(leaf, dtype)), y0)
 
 
-def _first_step(terms, solver, t0, t1, y0, args, controller) -> FirstStep | None:
+def chosen_first_step(terms, solver, t0, t1, y0, args, controller) -> FirstStep | None:
     tolerances = controller_tolerances(controller)
+    if isinstance(terms, MassMatrixTerm):
+        terms = dfx.ODETerm(terms.derivative)
     if tolerances is None or not isinstance(terms, dfx.ODETerm | DirectedTerm):
         return None
     return first_step(terms, solver, t0, t1, y0, args, tolerances)

@@ -1,15 +1,20 @@
-"""A solver of Diffrax alone, for comparisons."""
+"""A solver alone: one of Diffrax for comparisons, or a Rosenbrock method."""
 
 from typing import Any
 
 import diffrax as dfx
 import equinox as eqx
+import jax.numpy as jnp
 import jax.tree_util as jtu
 
 from .._compat import is_okay, save_y, update_result
 from .._custom_types import Args, RealScalarLike, Y
+from .._rosenbrock import AbstractRosenbrock
 from .._solver.implicit import with_accurate_stages
-from .outcome import raise_if_failed, result_of_saved
+from .mass_matrix import consistent_with_mass, trusting
+from .outcome import alone_messages, raise_if_failed, result_of_saved
+from .prepare import as_state, chosen_first_step, time_dtype
+from .start import Consistent
 
 
 def solve_without_hook(
@@ -22,11 +27,22 @@ def solve_without_hook(
     args: Args,
     saveat: dfx.SaveAt,
     throw: bool,
+    consistent: Consistent,
     **options: Any,
 ) -> dfx.Solution:
-    """What Diffrax returns, except that implicit stages are accurate and a state that is not finite
-    is no success."""
-    solver = with_accurate_stages(solver)
+    """What Diffrax returns, except that implicit stages are accurate, a state that is not finite is
+    no success, and Rosenbrock methods get a consistent start and a first step."""
+    solver, moved = with_accurate_stages(solver), None
+    if isinstance(solver, AbstractRosenbrock):
+        dtype = time_dtype(t0, t1, dt0, saveat)
+        y0, t0, t1 = as_state(y0, dtype), jnp.asarray(t0, dtype), jnp.asarray(t1, dtype)
+        y0, moved = consistent_with_mass(terms, t0, y0, args, consistent, throw)
+        solver = trusting(solver, consistent)
+        controller = options["stepsize_controller"]
+        if dt0 is None and (
+            first := chosen_first_step(terms, solver, t0, t1, y0, args, controller)
+        ):
+            dt0 = first.size
     subs = jtu.tree_leaves(saveat.subs, is_leaf=lambda x: isinstance(x, dfx.SubSaveAt))
     unseen = not any(sub.fn is save_y for sub in subs)
     watched = saveat
@@ -41,4 +57,6 @@ def solve_without_hook(
     sol = eqx.tree_at(
         lambda s: (s.ts, s.ys, s.result), sol, (ts, ys, result), is_leaf=lambda x: x is None
     )
-    return raise_if_failed(sol, ~is_okay(result), []) if throw else sol
+    if moved is not None:
+        sol = eqx.tree_at(lambda s: s.stats, sol, {**sol.stats, "initial_correction": moved})
+    return raise_if_failed(sol, ~is_okay(result), alone_messages(result, solver)) if throw else sol

@@ -13,6 +13,7 @@ from jaxtyping import Array
 from .._compat import is_okay, nonlinear_failure, update_result
 from .._custom_types import BoolScalar, FloatScalar, IntScalar, RealScalarLike, Y
 from .._projection_info import ProjectionInfo
+from .._rejection import is_repeatable, rejecting
 from .execution import Step
 
 
@@ -88,20 +89,6 @@ def conclude(
     return step.y1, error, dense_info, state, result
 
 
-def result_of_state(y: Y) -> RESULTS:
-    finite = [jnp.all(jnp.isfinite(leaf)) for leaf in jtu.tree_leaves(y)]
-    finite = functools.reduce(jnp.logical_and, finite)
-    return RESULTS.where(finite, RESULTS.successful, RESULTS.nonfinite)
-
-
-def is_repeatable(t0: RealScalarLike, t1: RealScalarLike, first_step: FloatScalar) -> BoolScalar:
-    """Whether a smaller step is possible at all within the precision of the time."""
-    t0, t1 = jnp.asarray(t0), jnp.asarray(t1)
-    scale = jnp.maximum(jnp.maximum(jnp.abs(t0), jnp.abs(t1)), first_step)
-    smallest = 100 * jnp.finfo(t1.dtype).eps * scale
-    return jnp.abs(t1 - t0) > smallest
-
-
 def _at_least(error: Y, raw: Y, y1: Y, repeatable: BoolScalar) -> Y:
     """The correction is a lower bound of the local error (Sudarsan & Keerthi 1998, 3.4).
 
@@ -114,13 +101,3 @@ def _at_least(error: Y, raw: Y, y1: Y, repeatable: BoolScalar) -> Y:
         return jnp.where(repeatable, jnp.maximum(jnp.abs(e), bound), e)
 
     return jtu.tree_map(raised, error, y1, raw)
-
-
-def rejecting(error: Y, success: BoolScalar, repeatable: BoolScalar) -> Y:
-    """Error estimate of a step that may have failed.
-
-    An infinite error makes an adaptive controller reject the step and try a smaller one.
-    Where there is none the step is let through, and its result code ends the solve.
-    """
-    verdict = jnp.where(repeatable, jnp.inf, 0.0)
-    return jtu.tree_map(lambda e: jnp.where(success, e, verdict.astype(e.dtype)), error)

@@ -6,12 +6,13 @@ from typing import Any
 import diffrax as dfx
 import equinox as eqx
 
-from .._compat import is_sde
+from .._compat import is_sde, undirected
 from .._constraint import AbstractConstraint
 from .._constraint_checks import check_constraint_type
 from .._custom_types import Args, RealScalarLike, Y
 from .._projection import NewtonProjection
 from .._projection_info import ProjectionInfo
+from .._rosenbrock import AbstractRosenbrock, MassMatrixTerm
 
 
 # One-step methods that keep no past values of y. Others (leapfrog, reversible) carry a
@@ -23,6 +24,7 @@ _SUPPORTED = (
     dfx.ImplicitEuler,
     dfx.EulerHeun,
     dfx.StratonovichMilstein,
+    AbstractRosenbrock,
 )
 
 
@@ -132,7 +134,7 @@ def _check_inner_solver(solver: Any, hook: str) -> None:
                 f"`HalfSolver({type(solver.solver).__name__}(...))` hides failed steps: put the hook outermost, "
                 f"`{hook}(HalfSolver(solver), constraint)`."
             )
-        if isinstance(solver.solver, dfx.AbstractImplicitSolver):
+        if isinstance(solver.solver, dfx.AbstractImplicitSolver | AbstractRosenbrock):
             raise ValueError(
                 f"`HalfSolver({type(solver.solver).__name__}())` does not work in Diffrax: it loses failures of the "
                 "implicit stages. Use the implicit solver itself, it has an error estimate: "
@@ -165,4 +167,13 @@ def check_noise(solver: dfx.AbstractSolver, terms: Any) -> None:
             f"`solver={type(solver).__name__}()` converges to the Ito solution, but projection makes it converge to "
             "the Stratonovich one. Write the equation in Stratonovich form and use `EulerHeun()`, `Heun()` or "
             "`StratonovichMilstein()`."
+        )
+
+
+def check_no_mass_matrix(terms: Any, hook: str) -> None:
+    """Refuse `M y' = f` where a hook needs y' itself."""
+    if isinstance(undirected(terms), MassMatrixTerm):
+        raise ValueError(
+            f"`terms` is an `mj.MassMatrixTerm`, but `mj.{hook}` needs y' itself. Use `mj.Projected(mj.Rodas5P(), "
+            "constraint)`, or for a regular mass matrix solve for y' in the vector field of a `diffrax.ODETerm`."
         )

@@ -18,7 +18,7 @@ from .._interpolation import CorrectedInterpolationFactory
 from .._projection import NewtonProjection
 from .._projection_info import ProjectionInfo
 from .advance import conclude, HookState
-from .base import AbstractManifoldSolver, check_hook_arguments, check_noise
+from .base import AbstractManifoldSolver, check_hook_arguments, check_no_mass_matrix, check_noise
 from .execution import execution_of, Step
 from .frame import Frame
 from .implicit import with_accurate_stages
@@ -90,6 +90,7 @@ class LocalCoordinates(AbstractManifoldSolver):
 
     def init(self, terms, t0: RealScalarLike, t1: RealScalarLike, y0: Y, args: Args) -> HookState:
         check_noise(self.solver, terms)
+        check_no_mass_matrix(terms, "LocalCoordinates")
         if self.chart.state is not None and is_sde(terms):
             raise ValueError(
                 f"`terms` has noise, which coordinates of `chart={type(self.chart).__name__}` are not for. Use "

@@ -13,10 +13,11 @@ from .._custom_types import Args, RealScalarLike, Y
 from .._interpolation import CorrectedInterpolationFactory
 from .._projection import NewtonProjection
 from .._projection_info import ProjectionInfo
+from .._rejection import result_of_state
 from .._stability import is_stable
 from .._stabilization import AbstractStabilization
-from .advance import conclude, HookState, result_of_state
-from .base import AbstractManifoldSolver, check_hook_arguments
+from .advance import conclude, HookState
+from .base import AbstractManifoldSolver, check_hook_arguments, check_no_mass_matrix
 from .execution import execution_of
 from .frame import Frame
 from .implicit import with_accurate_stages
@@ -101,6 +102,7 @@ class Stabilized(AbstractManifoldSolver):
                 "`terms` is a `MultiTerm`: which of its vector fields should be stabilized is not defined. Add "
                 "them up in one `diffrax.ODETerm`, or use `mj.Projected(solver, constraint)`."
             )
+        check_no_mass_matrix(terms, "Stabilized")
         check_constraint(self.constraint, t0, y0, args)
         terms = self._stabilized(terms)
         execution = execution_of(self.inner, terms, t0, t1, y0, args)

@@ -1,0 +1,196 @@
+r"""The algebraic equations in `M y' = f`, its derivative `y'`, and consistent states.
+
+Let `D` scale the rows of `M` to size one and `P` project onto the left null space of `D M`. The
+algebraic equations are $P D f(t, y) = 0$. Differentiated once, with $\hat z = (D M)^+ D f$, they are
+$P D (f_y - \partial_y (M \hat z))\, y' = -P D (f_t - \partial_t M\, \hat z)$, and together with
+$M y' = f$ they determine $y'$ if the index is 1:
+
+$$A y' = D M \hat z - s P D (f_t - \partial_t M\, \hat z), \qquad
+  A = D M + s P D (f_y - \partial_y (M \hat z)),$$
+
+for any $s > 0$, because the two parts of the sum lie in complementary spaces. The same matrix gives
+Newton's step $-A^{-1} s P D f$ for the algebraic equations, which leaves $M y$ as it is.
+(For constant null spaces this is Hairer & Wanner, Solving ODEs II, VI.1; otherwise $u^T M = 0$ for a
+null vector $u(t, y)$, differentiated, replaces the derivative of $u$ by that of $M$.)
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from .._custom_types import BoolScalar, FloatScalar, IntScalar, RealScalarLike
+from .._projection_info import ProjectionInfo
+from .elimination import factorize_pivoted
+
+
+_MOST_ITERATIONS = 50
+
+_FAULTS = (
+    "`terms` is not finite at the time and state given. Start from a state at which f(t, {y}, args) and its mass matrix "
+    "are defined.",
+    "The index of M y' = f is above 1 at `{y}`, or the equations do not determine y' at all: the algebraic equations "
+    "(the null space of `mass`) do not determine the part of y that `mass` does not see. Reduce the index first, for "
+    "example with `mj.reduce_dae`, or remove what is redundant.",
+    "`{y}` could not be made consistent with the algebraic equations of M y' = f (those that `mass` leaves without y'): "
+    "no nearby state satisfies them. Start closer, or check that they can hold.",
+    "`{y}` does not satisfy the algebraic equations of M y' = f (those that `mass` leaves without y'). Write "
+    '`consistent="project"` to have it corrected, or correct it first with `terms.consistent_state(t, y, args)`.',
+)
+INCONSISTENT = 3
+
+
+class Linearized(NamedTuple):
+    """At one time and state.
+
+    - `derivative`: `y'`.
+    - `newton`: Newton's step towards consistency.
+    - `kept`: what changes of the state do to `newton` beside it, `A^-1 M change`.
+    - `finite`, `regular`: whether the equations are defined there, and of index 1.
+    """
+
+    derivative: Float[Array, " n"]
+    newton: Float[Array, " n"]
+    kept: Callable[[Float[Array, " n"]], Float[Array, " n"]]
+    finite: BoolScalar
+    regular: BoolScalar
+
+
+class Equations(NamedTuple):
+    """`field(t, x)` and `mass(t, x)`, a scalar, a diagonal or a matrix."""
+
+    field: Callable[[RealScalarLike, Float[Array, " n"]], Float[Array, " n"]]
+    mass: Callable[[RealScalarLike, Float[Array, " n"]], Float[Array, "..."]]
+
+    def at(self, t: RealScalarLike, x: Float[Array, " n"]) -> Linearized:
+        f, M = self.field(t, x), _as_matrix(self.mass(t, x), x.size)
+        size = jax.lax.stop_gradient(jnp.max(jnp.abs(M), axis=1))
+        D = jnp.where(size > 0, 1 / jnp.where(size > 0, size, 1), 1)
+        M = D[:, None] * M
+        inverse, P = _null_space(M, self.mass(t, x).ndim < 2)
+        z = inverse @ (D * f)
+
+        def rest(t: RealScalarLike, x: Float[Array, " n"]) -> Float[Array, " n"]:
+            return D * (self.field(t, x) - _as_matrix(self.mass(t, x), x.size) @ z)
+
+        t = jnp.asarray(t, jnp.result_type(float, t))
+        K = P @ jax.jacfwd(rest, argnums=1)(t, x)
+        Kt = P @ jax.jvp(lambda t: rest(t, x), (t,), (jnp.ones_like(t),))[1]
+        largest = jax.lax.stop_gradient(jnp.max(jnp.abs(K), initial=0.0))
+        s = jnp.where(largest > 0, 1 / jnp.where(largest > 0, largest, 1), 1)
+        A = M + s * K
+        finite = jnp.all(jnp.isfinite(A)) & jnp.all(jnp.isfinite(f)) & jnp.all(jnp.isfinite(Kt))
+        regular = finite & _is_regular(jax.lax.stop_gradient(A))
+        factor = factorize_pivoted(jnp.where(regular, A, jnp.eye(x.size, dtype=A.dtype)))
+        nan = jnp.where(regular, 0.0, jnp.nan).astype(x.dtype)
+        return Linearized(
+            factor.solve(M @ z - s * Kt) + nan,
+            -factor.solve(s * (P @ (D * f))) + nan,
+            lambda change: factor.solve(M @ change),
+            finite,
+            regular,
+        )
+
+
+def _as_matrix(mass: Float[Array, "..."], n: int) -> Float[Array, "n n"]:
+    return mass if mass.ndim == 2 else jnp.diag(jnp.broadcast_to(mass, (n,)))
+
+
+def _null_space(
+    M: Float[Array, "n n"], diagonal: bool
+) -> tuple[Float[Array, "n n"], Float[Array, "n n"]]:
+    """`M^+`, and the projector onto the left null space of `M`, whose rows have size one."""
+    n = M.shape[0]
+    unit = n * jnp.finfo(M.dtype).eps
+    if diagonal:
+        d = jnp.diagonal(M)
+        zero = d == 0
+        return jnp.diag(jnp.where(zero, 0, 1 / jnp.where(zero, 1, d))), jnp.diag(
+            zero.astype(M.dtype)
+        )
+    M = jnp.where(jnp.all(jnp.isfinite(M)), M, jnp.eye(n, dtype=M.dtype))
+    inverse = jnp.linalg.pinv(M, rtol=10 * unit)
+    P = jnp.eye(n, dtype=M.dtype) - M @ inverse
+    # What is zero but for rounding would let large differential equations into the algebraic ones.
+    return inverse, jnp.where(jnp.abs(P) > 100 * unit, P, 0)
+
+
+def _is_regular(A: Float[Array, "n n"]) -> BoolScalar:
+    """Whatever the units of equations and unknowns."""
+    A = jnp.where(jnp.all(jnp.isfinite(A)), A, 0)
+    for axis in (1, 0):
+        size = jnp.max(jnp.abs(A), axis=axis, keepdims=True)
+        A = A / jnp.where(size > 0, size, 1)
+    values = jnp.linalg.svd(A, compute_uv=False)
+    return values[-1] > 100 * A.shape[0] * jnp.finfo(A.dtype).eps * values[0]
+
+
+def relative_size(change: Float[Array, " n"], x: Float[Array, " n"]) -> FloatScalar:
+    return jnp.max(jnp.abs(change) / (jnp.abs(x) + 1), initial=0.0)
+
+
+def is_consistent(x: Float[Array, " n"], linearized: Linearized) -> BoolScalar:
+    return linearized.regular & is_small(relative_size(linearized.newton, x))
+
+
+def is_small(correction: FloatScalar) -> BoolScalar:
+    """To half of the digits: what is beside that would have to be a mistake."""
+    return correction <= jnp.sqrt(jnp.finfo(correction.dtype).eps)
+
+
+class _Iterate(NamedTuple):
+    x: Float[Array, " n"]
+    step: Float[Array, " n"]
+    size: FloatScalar  # of the step
+    previous: FloatScalar
+    iterations: IntScalar
+
+
+def consistent(
+    equations: Equations, t: RealScalarLike, x: Float[Array, " n"]
+) -> tuple[Float[Array, " n"], ProjectionInfo]:
+    """`x` with the part that `M` does not see corrected; `x` itself where that fails.
+
+    Iterated without derivatives; one Newton step that changes nothing has them.
+    """
+    unit = 4 * jnp.finfo(x.dtype).eps
+    fixed, t_fixed = jax.lax.stop_gradient((x, t))
+    start = equations.at(t_fixed, fixed)
+
+    def iterate(x, previous, iterations):
+        step = jax.lax.stop_gradient(equations.at(t_fixed, x).newton)
+        return _Iterate(x, step, relative_size(step, x), previous, iterations)
+
+    def unfinished(i: _Iterate):
+        shrinking = (i.size < i.previous) | (i.iterations < 10)
+        return (i.size > unit) & shrinking & (i.iterations < _MOST_ITERATIONS)
+
+    def advance(i: _Iterate):
+        return iterate(i.x + i.step, i.size, i.iterations + 1)
+
+    first = iterate(fixed, jnp.asarray(jnp.inf, x.dtype), jnp.zeros((), jnp.int32))
+    end = jax.lax.while_loop(unfinished, advance, first)
+    success = end.size <= 1e3 * unit
+    moved = jax.lax.stop_gradient(jnp.where(success, end.x, fixed))
+    there = equations.at(t, moved)
+    change = there.newton + there.kept(x - moved)
+    out = jnp.where(success, moved + (change - jax.lax.stop_gradient(change)), x)
+    info = ProjectionInfo(
+        multipliers=jnp.zeros((0,), x.dtype),
+        iterations=end.iterations,
+        residual=jnp.where(
+            start.finite, jnp.where(jnp.isnan(end.size), jnp.inf, end.size), jnp.nan
+        ),
+        correction=relative_size(moved - fixed, fixed),
+        full_rank=start.regular,
+        success=success,
+    )
+    return out, info
+
+
+def faults_of_start(info: ProjectionInfo) -> tuple[IntScalar, tuple[str, ...]]:
+    """The number of a message, and all of them."""
+    cause = jnp.where(info.full_rank, 2, 1)
+    return jnp.where(jnp.isnan(info.residual), 0, cause), _FAULTS

@@ -1,0 +1,183 @@
+"""`M y' = f`: the term, and its mass matrix in the forms that users give it."""
+
+from collections.abc import Callable
+from typing import Any, NoReturn
+
+import diffrax as dfx
+import equinox as eqx
+import jax.flatten_util as jfu
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jaxtyping import Array, Float
+
+from .._constraint_checks import check_state
+from .._custom_types import Args, RealScalarLike, Y
+from .._diagnosis import Diagnosis
+from .._errors import clear_errors
+from .._linear import multiply
+from .._projection_info import ProjectionInfo
+from .._user_function import check_function
+from .algebraic import consistent, Equations, faults_of_start
+
+
+class MassMatrixTerm(dfx.AbstractTerm):
+    r"""`M(t, y, args) y' = f(t, y, args)`: an implicit ODE, or where `M` is singular a
+    differential-algebraic equation (DAE) of index 1.
+
+    For [`Rodas5P`][] and [`Rodas3P`][], alone or in [`Projected`][]. All other solvers
+    would ignore the mass matrix, and raise.
+
+    The left null space of `M` says which equations are algebraic: $u^T M = 0$ leaves
+    $0 = u^T f(t, y)$. The index is 1 where these equations determine the part of `y` that `M` does
+    not see: where $M + P\, \partial f/\partial y$ is regular, with `P` the projector onto that null
+    space. With a higher index (mechanics with constraints on positions, constraints of optimal
+    control) reduce it first, for example with `mj.reduce_dae`.
+
+    **Arguments:**
+
+    - `vector_field`: `f(t, y, args)`, of the structure of `y`. In an algebraic equation it is what
+        has to be zero.
+    - `mass`: the matrix, or a callable `M(t, y, args)` that returns it: a scalar, the diagonal
+        (shape `(n,)`, or a pytree with the structure and shapes of `y`), or a matrix of shape
+        `(n, n)`, for the `n` numbers of `y` in the order of `jax.flatten_util.ravel_pytree`. Of
+        constant rank.
+
+    The initial value has to satisfy the algebraic equations. [`mj.diffeqsolve`][] sees to that
+    (`consistent="project"` changes only what `M` does not see, `"check"` refuses); with
+    `diffrax.diffeqsolve` call [`consistent_state`][.consistent_state] first, or the solve ends
+    at once with `RESULTS.nonlinear_divergence`.
+
+    **Raises:**
+
+    `TypeError` and `ValueError` for masses of another kind or shape.
+
+    Source: Hairer & Wanner, Solving ODEs II, chapter VI (index 1), VI.6 for masses that depend on
+    the state.
+    """
+
+    vector_field: Callable[[RealScalarLike, Y, Args], Y]
+    mass: Any
+
+    def __init__(self, vector_field: Callable[[RealScalarLike, Y, Args], Y], mass: Any):
+        check_function("vector_field", vector_field, "f(t, y, args)")
+        if callable(mass):
+            check_function("mass", mass, "M(t, y, args)")
+        else:
+            _check_numbers(mass)
+        self.vector_field = vector_field
+        self.mass = mass
+
+    def vf(self, t: RealScalarLike, y: Y, args: Args) -> Y:
+        return self.vector_field(t, y, args)
+
+    def contr(self, t0: RealScalarLike, t1: RealScalarLike, **kwargs: Any) -> RealScalarLike:
+        return t1 - t0
+
+    def prod(self, vf: Any, control: RealScalarLike) -> NoReturn:
+        """What solvers that do not know of mass matrices add to the state."""
+        raise ValueError(
+            "`terms` is an `mj.MassMatrixTerm`, whose mass matrix this solver would ignore. Use `mj.Rodas5P()` or "
+            "`mj.Rodas3P()`, alone or in `mj.Projected`. For another solver and a regular mass matrix solve for y' in "
+            "the vector field of a `diffrax.ODETerm`."
+        )
+
+    def consistent_state(
+        self, t: RealScalarLike, y: Y, args: Args = None, *, throw: bool = True
+    ) -> tuple[Y, ProjectionInfo]:
+        """An initial value that satisfies the algebraic equations at time `t`.
+
+        Newton's method for the part of `y` that `M` does not see, from `y`; `M y` is kept (with
+        constant `M`). A consistent state is returned unchanged. Differentiable.
+
+        **Returns:**
+
+        `(y, info)`, with `info.correction` the largest `|change| / (|y| + 1)`, `info.full_rank`
+        whether the index is 1 there, and `info.success`.
+
+        **Raises:**
+
+        With `throw=True` a `RuntimeError` where there is no such state near `y`, or the index is
+        above 1.
+        """
+        return _consistent_state(self, t, y, args, throw)
+
+    def derivative(self, t: RealScalarLike, y: Y, args: Args = None) -> Y:
+        """`y'` at a consistent state; not finite where the index is above 1."""
+        x, unravel = jfu.ravel_pytree(y)
+        return unravel(self.equations(y, args).at(t, x).derivative)
+
+    def equations(self, y: Y, args: Args) -> Equations:
+        """In the vector of all numbers of the state; `y` is an example of one."""
+        _, unravel = jfu.ravel_pytree(y)
+
+        def field(t: RealScalarLike, x: Float[Array, " n"]) -> Float[Array, " n"]:
+            return ravelled_like(y, self.vector_field(t, unravel(x), args))
+
+        return Equations(field, lambda t, x: mass_values(self.mass, t, unravel(x), args))
+
+
+@clear_errors
+@eqx.filter_jit
+def _consistent_state(
+    term: MassMatrixTerm, t: RealScalarLike, y: Y, args: Args, throw: bool
+) -> tuple[Y, ProjectionInfo]:
+    check_state(y, "y")
+    y = jtu.tree_map(jnp.asarray, y)
+    x, unravel = jfu.ravel_pytree(y)
+    x, info = consistent(term.equations(y, args), t, x)
+    y = unravel(x)
+    if throw:
+        y = Diagnosis(*faults_of_start(info)).raise_unless(info.success, y, "y")
+    return y, info
+
+
+def ravelled_like(y: Y, value: Any) -> Float[Array, " n"]:
+    """What a vector field returned, as a vector; refused if it is not like the state."""
+    shapes = lambda tree: jtu.tree_map(jnp.shape, tree)
+    same = jtu.tree_structure(value) == jtu.tree_structure(y)
+    if not same or jtu.tree_leaves(shapes(value)) != jtu.tree_leaves(shapes(y)):
+        raise ValueError(
+            f"`vector_field` must return what `y` is made of, arrays of the shapes {shapes(y)}, got {shapes(value)}."
+        )
+    cast = lambda leaf, v: jnp.asarray(v, jnp.result_type(leaf))
+    return jfu.ravel_pytree(jtu.tree_map(cast, y, value))[0]
+
+
+def mass_values(mass: Any, t: RealScalarLike, y: Y, args: Args) -> Float[Array, "..."]:
+    """A scalar, a diagonal `(n,)` or a matrix `(n, n)`."""
+    if callable(mass):
+        mass = mass(t, y, args)
+        _check_numbers(mass)
+    x, _ = jfu.ravel_pytree(y)
+    n = x.size
+    if eqx.is_array_like(mass) and jnp.shape(mass) in ((), (n,), (n, n)):
+        return jnp.asarray(mass, x.dtype)
+    shapes = lambda tree: jtu.tree_map(jnp.shape, tree)
+    same = jtu.tree_structure(mass) == jtu.tree_structure(y)
+    if same and jtu.tree_leaves(shapes(mass)) == jtu.tree_leaves(shapes(y)):
+        cast = lambda leaf, M: jnp.asarray(M, jnp.result_type(leaf))
+        return jfu.ravel_pytree(jtu.tree_map(cast, y, mass))[0]
+    raise ValueError(
+        f"`mass` must be a scalar, a diagonal of shape ({n},) or of the shapes of y, or a matrix of shape ({n}, {n}) "
+        f"for y of {n} numbers of shapes {shapes(y)}, got {shapes(mass)}."
+    )
+
+
+def _check_numbers(mass: Any) -> None:
+    leaves = jtu.tree_leaves(mass)
+    for leaf in leaves:
+        if not eqx.is_array_like(leaf) or jnp.issubdtype(
+            jnp.result_type(leaf), jnp.complexfloating
+        ):
+            kind = jnp.result_type(leaf) if eqx.is_array_like(leaf) else type(leaf).__name__
+            raise TypeError(
+                "`mass` must be made of real numbers: a scalar, a diagonal, a matrix, or a callable `M(t, y, args)` "
+                f"that returns one, got {kind}."
+            )
+    if not leaves:
+        raise TypeError("`mass` is empty. Without a mass matrix use `diffrax.ODETerm(f)`.")
+
+
+def product(mass: Float[Array, "..."], v: Float[Array, " n"]) -> Float[Array, " n"]:
+    """`M v`."""
+    return multiply(mass, v) if mass.ndim == 2 else mass * v

@@ -1,0 +1,155 @@
+"""Rosenbrock methods as Diffrax solvers."""
+
+from collections.abc import Callable
+from typing import Any, ClassVar
+
+import diffrax as dfx
+import equinox as eqx
+import jax.flatten_util as jfu
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from diffrax import RESULTS
+from jaxtyping import Array, Float
+
+from .._compat import is_okay, is_sde, nonlinear_failure, time_direction, undirected
+from .._constraint_checks import check_state
+from .._custom_types import Args, BoolScalar, FloatScalar, RealScalarLike, Y
+from .._rejection import is_repeatable, rejecting
+from .algebraic import is_consistent
+from .interpolation import RosenbrockInterpolation
+from .stages import rosenbrock_step
+from .system import mass_matrix_term, System
+from .tableau import RODAS3P, RODAS5P, RosenbrockTableau
+
+
+class RosenbrockState(eqx.Module):
+    """Carried from step to step: the size of the first step that was tried (the scale of time near
+    t = 0), `y'` where the mass matrix depends on the state, and whether the start can be used."""
+
+    first_step: FloatScalar
+    derivative: Float[Array, " n"] | None
+    usable: BoolScalar
+
+
+class AbstractRosenbrock(dfx.AbstractAdaptiveSolver):
+    """Linearly implicit one-step methods: instead of equations to be iterated each stage has a
+    linear system, all with the matrix `M / gamma - h df/dy`, which is factored once per step."""
+
+    tableau: eqx.AbstractClassVar[RosenbrockTableau]
+    checks_start: eqx.AbstractVar[bool]  # not where the state has been made consistent before
+
+    term_structure: ClassVar = dfx.AbstractTerm
+    interpolation_cls: ClassVar[Callable[..., RosenbrockInterpolation]] = RosenbrockInterpolation
+
+    def order(self, terms: Any) -> int:
+        return self.tableau.order
+
+    def func(self, terms: Any, t0: RealScalarLike, y0: Y, args: Args) -> Any:
+        return terms.vf(t0, y0, args)
+
+    def init(
+        self, terms: Any, t0: RealScalarLike, t1: RealScalarLike, y0: Y, args: Args
+    ) -> RosenbrockState:
+        check_state(y0)
+        _check_terms(terms)
+        derivative, usable = None, jnp.asarray(True)
+        term = mass_matrix_term(terms)
+        if term is not None:
+            direction = time_direction(terms)
+            x, _ = jfu.ravel_pytree(y0)
+            start = term.equations(y0, args).at(t0 * direction, x)
+            if self.checks_start:
+                usable = is_consistent(x, start)
+            if callable(term.mass):
+                derivative = start.derivative * jnp.asarray(direction, x.dtype)
+        return RosenbrockState(jnp.abs(jnp.asarray(t1) - t0), derivative, usable)
+
+    def step(
+        self,
+        terms: Any,
+        t0: RealScalarLike,
+        t1: RealScalarLike,
+        y0: Y,
+        args: Args,
+        solver_state: RosenbrockState,
+        made_jump: Any,
+    ) -> tuple[Y, Y | None, dict[str, Any], RosenbrockState, RESULTS]:
+        system = System.of(terms, t0, t1, y0, args)
+        x0, unravel = jfu.ravel_pytree(y0)
+        derivative = system.refreshed(made_jump, solver_state.derivative, x0)
+        step = rosenbrock_step(self.tableau, system, x0, derivative)
+        finite = jnp.all(jnp.isfinite(step.x1)) & jnp.all(jnp.isfinite(step.error))
+        result = RESULTS.where(finite, RESULTS.successful, RESULTS.nonfinite)
+        singular = step.defined & ~step.regular | ~solver_state.usable
+        result = RESULTS.where(singular, nonlinear_failure(), result)
+        # No smaller step helps where the equations are not defined at its beginning.
+        repeatable = is_repeatable(t0, t1, solver_state.first_step)
+        repeatable &= step.defined & solver_state.usable
+        usable = jnp.where(solver_state.usable, 0.0, jnp.nan).astype(x0.dtype)
+        y1 = unravel(step.x1 + usable)
+        error = rejecting(unravel(step.error), is_okay(result), repeatable)
+        dense_info = dict(y0=y0, y1=y1, k=tuple(unravel(k) for k in step.dense))
+        state = RosenbrockState(solver_state.first_step, step.derivative, solver_state.usable)
+        return y1, error, dense_info, state, result
+
+
+class Rodas5P(AbstractRosenbrock):
+    r"""Rosenbrock method of order 5 (error estimate and dense output of order 4) with eight stages,
+    for stiff ODEs and, with a [`MassMatrixTerm`][], differential-algebraic equations of
+    index 1. Stiffly accurate and L-stable.
+
+    Each step evaluates the exact Jacobian once (forward mode, also by time), factors one matrix
+    $M/\gamma - h\, \partial f/\partial y$ and solves with it once per stage: nothing is
+    iterated. Small systems are solved by written-out arithmetic, without LAPACK.
+
+    Works as any solver of Diffrax: with `diffrax.diffeqsolve` and [`mj.diffeqsolve`][],
+    forwards and backwards in time, in [`Projected`][] (also with a mass matrix),
+    [`LocalCoordinates`][] and [`Stabilized`][] (without one). All adjoints work; derivatives
+    are those of the steps, second derivatives of `f` included.
+
+    Order 5 is kept for non-autonomous equations, for `M y' = f` with constant or regular
+    `M(t, y)` and for DAEs of index 1 with constant `M`; with a singular `M` that depends on time or
+    state it is 3. Fast components that follow a forcing, $y' = \lambda (y - \varphi(t)) +
+    \varphi'(t)$ (Prothero & Robinson), have errors of order $h^3 / |\lambda|$ while
+    $h |\lambda| \gg 1$, where the stage order shows, and $h^5$ below.
+
+    Prefer [`Rodas3P`][] for tolerances of 1e-3 and above, `diffrax.Kvaerno5()` where the Jacobian is
+    far more expensive than the vector field, `diffrax.Tsit5()` where nothing is stiff.
+
+    **Raises:**
+
+    `ValueError` for terms with noise or controls. At run time `RESULTS.nonlinear_divergence`
+    where the matrix is singular at all step sizes, or the initial value is not consistent (see
+    [`MassMatrixTerm`][]), and `RESULTS.nonfinite` where `f` is not finite at an accepted state.
+
+    Source: Steinebach, BIT Numer. Math. 63:27 (2023); coefficients as published there, dense output
+    included. Hairer & Wanner, Solving ODEs II, IV.7 and VI.4 (methods and their implementation).
+    """
+
+    tableau: ClassVar[RosenbrockTableau] = RODAS5P
+    checks_start: bool = True
+
+
+class Rodas3P(AbstractRosenbrock):
+    r"""Rosenbrock method of order 3 (error estimate of order 2, dense output 3) with five stages and
+    three evaluations of the vector field, for loose tolerances; all else as [`Rodas5P`][].
+
+    Order 3 is kept as order 5 is by [`Rodas5P`][]; with a singular `M` that depends on time or
+    state it is 2. Fast components that follow a forcing have errors of order $h^2 / |\lambda|$.
+
+    Source: Steinebach, Rosenbrock methods within OrdinaryDiffEq.jl - Overview, recent developments
+    and applications, Proc. JuliaCon Conf. (2024).
+    """
+
+    tableau: ClassVar[RosenbrockTableau] = RODAS3P
+    checks_start: bool = True
+
+
+def _check_terms(terms: Any) -> None:
+    is_control = lambda x: isinstance(x, dfx.ControlTerm)
+    leaves = jtu.tree_leaves(undirected(terms), is_leaf=is_control)
+    if is_sde(terms) or any(is_control(leaf) for leaf in leaves):
+        raise ValueError(
+            "`terms` has noise or a control, which Rosenbrock methods are not for: they need df/dt. Of a smooth control "
+            "make an ODE, `diffrax.ControlTerm(f, control).to_ode()`."
+        )

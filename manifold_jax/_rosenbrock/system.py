@@ -1,0 +1,100 @@
+"""What one step of a Rosenbrock method solves, in the vector of all numbers of the state."""
+
+from typing import Any, NamedTuple
+
+import diffrax as dfx
+import jax
+import jax.flatten_util as jfu
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from .._compat import directed, time_direction, undirected
+from .._custom_types import Args, RealScalarLike, Y
+from .mass_matrix import mass_values, MassMatrixTerm, product, ravelled_like
+
+
+Vector = Float[Array, " n"]
+
+
+class System(NamedTuple):
+    """`M y' = f` over one step from `t0` to `t1`.
+
+    - `terms`: those of `f` alone.
+    - `mass`: the mass matrix, or `None` for one of ones.
+    """
+
+    terms: Any
+    mass: MassMatrixTerm | None
+    t0: RealScalarLike
+    t1: RealScalarLike
+    y0: Y
+    args: Args
+
+    @staticmethod
+    def of(terms: Any, t0: RealScalarLike, t1: RealScalarLike, y0: Y, args: Args) -> "System":
+        mass = mass_matrix_term(terms)
+        if mass is not None:
+            terms = directed(dfx.ODETerm(mass.vector_field), time_direction(terms))
+        return System(terms, mass, t0, t1, y0, args)
+
+    @property
+    def state_dependent(self) -> bool:
+        return self.mass is not None and callable(self.mass.mass)
+
+    @property
+    def step(self) -> Array:
+        return jnp.asarray(self.t1) - self.t0
+
+    def time(self, c: float) -> Array:
+        return self.t0 + c * self.step
+
+    def increment(self, t: RealScalarLike, x: Vector) -> Vector:
+        """`h f(t, x)`."""
+        control = self.terms.contr(self.t0, self.t1)
+        value = self.terms.vf_prod(t, self._unravel(x), self.args, control)
+        return ravelled_like(self.y0, value)
+
+    def mass_at(self, t: RealScalarLike, x: Vector) -> Float[Array, "..."] | None:
+        if self.mass is None:
+            return None
+        true_time = t * time_direction(self.terms)
+        return mass_values(self.mass.mass, true_time, self._unravel(x), self.args)
+
+    def linearized(
+        self, x0: Vector, displacement: Vector | None
+    ) -> tuple[Vector, Float[Array, "n n"], Vector]:
+        """`h f`, its Jacobian and `h` times its derivative by time at the beginning; if the mass
+        depends on the state, the derivatives are those of `h f - M displacement`."""
+
+        def rest(t: RealScalarLike, x: Vector) -> tuple[Vector, Vector]:
+            value = self.increment(t, x)
+            if displacement is None:
+                return value, value
+            return value - product(self.mass_at(t, x), displacement), value
+
+        t0 = jnp.asarray(self.t0)
+        _, column, f0 = jax.linearize(lambda x: rest(t0, x), x0, has_aux=True)
+        J = jax.vmap(column, out_axes=1)(jnp.eye(x0.size, dtype=x0.dtype))
+        _, T = jax.jvp(lambda t: rest(t, x0)[0], (t0,), (self.step.astype(t0.dtype),))
+        return f0, J, T
+
+    def refreshed(self, made_jump: Any, derivative: Vector | None, x0: Vector) -> Vector | None:
+        """The carried derivative `y'`, computed anew behind a jump of the field."""
+        if derivative is None or made_jump is False:
+            return derivative
+        direction = time_direction(self.terms)
+
+        def compute() -> Vector:
+            at = self.mass.equations(self.y0, self.args).at(self.t0 * direction, x0)  # pyright: ignore
+            return at.derivative * jnp.asarray(direction, x0.dtype)
+
+        return jax.lax.cond(made_jump, compute, lambda: derivative)
+
+    def _unravel(self, x: Vector) -> Y:
+        return jfu.ravel_pytree(self.y0)[1](x)
+
+
+def mass_matrix_term(terms: Any) -> MassMatrixTerm | None:
+    """That of an equation with a mass matrix, also if time is negated."""
+    inner = undirected(terms)
+    return inner if isinstance(inner, MassMatrixTerm) else None

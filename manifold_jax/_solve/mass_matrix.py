@@ -1,0 +1,43 @@
+"""The initial value of `M y' = f`: corrected, checked, or trusted, as for a manifold."""
+
+from typing import Any
+
+import jax.numpy as jnp
+import jax.tree_util as jtu
+
+from .._custom_types import Args, FloatScalar, RealScalarLike, Y
+from .._diagnosis import Diagnosis
+from .._rosenbrock import AbstractRosenbrock, MassMatrixTerm
+from .._rosenbrock.algebraic import faults_of_start, INCONSISTENT, is_small
+from .start import Consistent
+
+
+def consistent_with_mass(
+    terms: Any, t0: RealScalarLike, y0: Y, args: Args, consistent: Consistent, throw: bool
+) -> tuple[Y, FloatScalar | None]:
+    """The state to start from, and how far it was moved (`None` without a mass matrix). With `throw`
+    the error that names the cause is attached to it; otherwise the first step fails for it."""
+    if not isinstance(terms, MassMatrixTerm) or consistent == "assume":
+        return y0, None
+    start, info = terms.consistent_state(t0, y0, args, throw=False)
+    success, correction = info.success, info.correction
+    cause, messages = faults_of_start(info)
+    if consistent == "check":
+        success = info.success & is_small(correction)
+        cause = jnp.where(info.success, INCONSISTENT, cause)
+        start, correction = y0, jnp.zeros_like(correction)
+    if throw:
+        start = Diagnosis(cause, messages).raise_unless(success, start, "y0")
+    return start, correction
+
+
+def trusting(solver: Any, consistent: Consistent) -> Any:
+    """The solver, without its own check of the start where that is to be trusted."""
+    is_rosenbrock = lambda x: isinstance(x, AbstractRosenbrock)
+    if consistent != "assume":
+        return solver
+    return jtu.tree_map(
+        lambda s: type(s)(checks_start=False) if is_rosenbrock(s) else s,
+        solver,
+        is_leaf=is_rosenbrock,
+    )
