@@ -118,3 +118,20 @@ def test_structure_is_folded():
 def test_a_limit():
     with pytest.raises(NotScalarError, match="more than 3 operations"):
         in_lanes(jnp.sin, jnp.ones((SIZE, 4)), limit=3)
+
+
+def test_sines_are_computed_once():
+    """XLA thinks them cheap, and would compute them anew for every number that depends on them."""
+
+    def function(x):
+        s = jnp.sin(x[0])
+        return jnp.stack([jnp.exp(k * s) for k in range(1, 6)])
+
+    def run(x):
+        lanes = Lanes(SIZE, 100)
+        with lanes.inside(x[0]):
+            out = call_in_lanes(lanes, function, Value.of_whole(x))
+            return out.columns(lanes)
+
+    program = jax.jit(run).lower(jnp.ones((1, SIZE))).compile().as_text()
+    assert program.count(" sine(") == 1

@@ -112,9 +112,8 @@ class WayBack:
 
     def _through_group(self, carry: Any, index: Array) -> tuple[Any, list[Array]]:
         record, common = carry
-        with self.lanes.inside():
-            present = index < self.size
-            index = jnp.minimum(index, self.size - 1)
+        present, index = index < self.size, jnp.minimum(index, self.size - 1)
+        with self.lanes.inside(self.starts[0][index]):
             each, rest = taken(self.each, index), taken(self.rest, index)
             group = Group(index, present & self.needed[index], each, rest)
             last = taken(columns_of_arrays(self.ends.last_bar), index)

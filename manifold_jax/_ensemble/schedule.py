@@ -117,8 +117,9 @@ class Schedule:
 
         def begin(index: Array) -> tuple[list[Array], list[Array]]:
             nonlocal layout
-            with self.lanes.inside():
-                start = self._call(self.equations.begin, taken(self.given, index))
+            given = taken(self.given, index)
+            with self.lanes.inside(given[0]):
+                start = self._call(self.equations.begin, given)
                 layout = Layout.of(start.trajectory)
                 columns = columns_of_values(start.trajectory, self.lanes)
                 return columns, columns_of_values(start.correction, self.lanes)

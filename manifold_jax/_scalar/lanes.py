@@ -19,9 +19,11 @@ class NotScalarError(Exception):
 # XLA for CPUs copies a result into every kernel that needs it, with all that leads to it, unless it is
 # one of these.
 _COMPUTED_ONCE = frozenset(
-    "acos acosh asin asinh atan atan2 atanh cbrt cos cosh div erf exp exp2 expm1 log log1p logistic pow rem "
-    "rsqrt sin sinh sqrt tan tanh".split()
+    "acos acosh asin asinh atan atan2 atanh cbrt cosh div erf exp exp2 expm1 log log1p logistic pow rem "
+    "rsqrt sinh sqrt tan tanh".split()
 )
+# Those take as long as many other operations, but are not among them.
+_LONG = {"sin": 50, "cos": 50}
 # Operations that may be copied. A division, which is what it takes to have a result computed once,
 # takes as long.
 _DIVISION = 8
@@ -99,7 +101,8 @@ class Lanes:
         else:
             arrays = [jnp.asarray(y) for y in operands]
         array = node.primitive.bind(*arrays, **node.params)
-        node.copied = 1 + sum(y.copied for y in node.operands if isinstance(y, Node))
+        operands = sum(y.copied for y in node.operands if isinstance(y, Node))
+        node.copied = _LONG.get(node.primitive.name, 1) + operands
         if node.primitive.name in _COMPUTED_ONCE:
             node.copied = 0
         elif node.copied * (node.uses - 1) > _DIVISION and self._can_settle(array):
