@@ -82,3 +82,15 @@ def save_states(state: Any) -> list[SaveState]:
     is_save_state = lambda x: isinstance(x, SaveState)
     leaves = jtu.tree_leaves(state.save_state, is_leaf=is_save_state)
     return [leaf for leaf in leaves if is_save_state(leaf)]
+
+
+def scan_counts(equation: Any) -> tuple[int, int]:
+    """Of a traced `lax.scan`, how many of its inputs are constants and how many are carried. JAX 0.12 has no
+    parameters that say so; what is scanned over has one axis less in the body."""
+    body = getattr(equation.params["jaxpr"], "jaxpr", equation.params["jaxpr"])
+    scanned = lambda outer, inner: sum(
+        a.aval.ndim > b.aval.ndim for a, b in zip(outer, inner, strict=True)
+    )
+    num_carry = len(equation.outvars) - scanned(equation.outvars, body.outvars)
+    num_scanned = scanned(equation.invars, body.invars)
+    return len(equation.invars) - num_carry - num_scanned, num_carry

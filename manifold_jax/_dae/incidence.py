@@ -15,6 +15,7 @@ import jax
 import numpy as np
 from jax.extend import core
 
+from .._compat import scan_counts
 from .rules import known_value, RULES, union, Value
 
 
@@ -166,7 +167,7 @@ def _until_unchanged(once: Callable, carry: list[Value]) -> list[Value]:
 
 def _scan(walk: Walk, equation: Any, values: list[Value]) -> list[Value]:
     parameters = equation.params
-    n, m, length = parameters["num_consts"], parameters["num_carry"], parameters["length"]
+    (n, m), length = scan_counts(equation), parameters["length"]
     constants, carry, xs = values[:n], values[n : n + m], values[n + m :]
     if not 0 < length <= _MOST_ITERATIONS:
         return _long_scan(walk, equation, constants, carry, xs)

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from .._compat import scan_counts
 from .arithmetic import apply
 from .lanes import Lanes
 from .value import object_array, Value
@@ -58,13 +59,7 @@ def scan(
     params, length = equation.params, equation.params["length"]
     if length > _LONGEST_WRITTEN_OUT:
         return None
-    # What is scanned over has one axis less in the body.
-    body = getattr(params["jaxpr"], "jaxpr", params["jaxpr"])
-    scanned = lambda outer, inner: sum(
-        a.aval.ndim > b.aval.ndim for a, b in zip(outer, inner, strict=True)
-    )
-    num_carry = len(equation.outvars) - scanned(equation.outvars, body.outvars)
-    num_consts = len(values) - num_carry - scanned(equation.invars, body.invars)
+    num_consts, num_carry = scan_counts(equation)
     consts, carry = values[:num_consts], values[num_consts : num_consts + num_carry]
     stacked = [x.numbers() for x in values[num_consts + num_carry :]]
     dtypes = [x.dtype for x in values[num_consts + num_carry :]]
