@@ -68,7 +68,7 @@ def measure(size: int, lanes: int, tolerance: float, repeats: int) -> list[Row]:
             name,
             size,
             float(np.mean(end.num_steps)),
-            _largest_violation(end.ys),
+            largest_violation(end.ys),
             max(float(np.max(np.abs(a - b))) for a, b in zip(end.ys, ours, strict=True)),
             us[name],
             us[name] / us[SCALAR] if SCALAR in us else None,
@@ -171,7 +171,7 @@ def _program(
     return run
 
 
-def _largest_violation(ys: tuple[np.ndarray, np.ndarray]) -> float:
+def largest_violation(ys: tuple[np.ndarray, np.ndarray]) -> float:
     """Of the lengths and the velocities of the links."""
     links, rates = (np.diff(part.reshape(-1, 2, 2), axis=1, prepend=0.0) for part in ys)
     positions = (np.sum(links**2, axis=2) - 1) / 2

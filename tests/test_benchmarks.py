@@ -20,6 +20,7 @@ PEERS = ("casadi", "mujoco", "pydiffsol", "sksundae")
 # Without those that compile or train for a minute and more (`gradients`, `neural`, `overhead`, `thresholds`) and
 # `fuzz`, which has tests of its own.
 SMALLEST = {
+    "accelerator": dict(sizes="4", lanes=2, repeats=1, problems="lorenz"),
     "approaches": dict(problems="pendulum", repeats=1, quick=True),
     "closed_forms": dict(repeats=1),
     "compile_time": dict(compilations=1, repeats=1, only="pendulum"),

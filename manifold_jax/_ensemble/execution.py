@@ -13,9 +13,11 @@ from .in_lanes import solve_in_lanes, solve_in_lanes_forwards
 from .mapped import solve_mapped
 from .parts import Inputs
 from .solution import EnsembleSolution
+from .unconstrained import Unconstrained
 
 
 def solve_on_one_device(inputs: Inputs, lanes: int) -> EnsembleSolution:
+    inputs = _with_hook(inputs)
     obstacle = _obstacle(inputs)
     if obstacle is None:
         forwards = isinstance(inputs[0].adjoint, dfx.ForwardMode)
@@ -28,12 +30,18 @@ def solve_on_one_device(inputs: Inputs, lanes: int) -> EnsembleSolution:
     return dataclasses.replace(solve_mapped(inputs, lanes), execution=execution)
 
 
+def _with_hook(inputs: Inputs) -> Inputs:
+    """Lanes advance solvers of this library, of which one leaves states as they are."""
+    equations, batch = inputs
+    if isinstance(equations.solver, AbstractManifoldSolver):
+        return inputs
+    return dataclasses.replace(equations, solver=Unconstrained(equations.solver)), batch
+
+
 def _obstacle(inputs: Inputs) -> str | None:
     """What keeps trajectories out of lanes."""
     equations, batch = inputs
     one, saveat, solver = batch.one(), equations.saveat, equations.solver
-    if not isinstance(solver, AbstractManifoldSolver):
-        return f"`solver` is {type(solver).__name__} without a hook"
     if not isinstance(equations.terms, dfx.ODETerm | DirectedTerm):
         return f"`terms` are {type(equations.terms).__name__}, not an ODETerm"
     if not is_unrollable(solver.inner, equations.terms, one.t0, one.t1, one.y0, one.args):

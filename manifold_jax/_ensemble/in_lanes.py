@@ -16,6 +16,7 @@ from .parts import in_steps, Inputs, times_are_differentiated
 from .rows import saved_rows
 from .schedule import Run, Schedule
 from .solution import EnsembleSolution
+from .unconstrained import Unconstrained
 
 
 # Operations on one number, of a start and a step, beyond which trajectories are mapped over instead. A
@@ -40,11 +41,14 @@ def _run(inputs: Inputs, lanes: int) -> tuple[EnsembleSolution, Run]:
         "num_steps": outcome.num_steps,
         "num_accepted_steps": outcome.num_accepted,
         "num_rejected_steps": outcome.num_steps - outcome.num_accepted,
-        "initial_correction": run.start.correction,
-        "num_projection_iterations": statistics.iterations,
-        "largest_correction": statistics.largest_correction,
-        "correction_share": jax.vmap(lambda s: s.correction_share)(statistics),
     }
+    if not isinstance(equations.solver, Unconstrained):
+        stats |= {
+            "initial_correction": run.start.correction,
+            "num_projection_iterations": statistics.iterations,
+            "largest_correction": statistics.largest_correction,
+            "correction_share": jax.vmap(lambda s: s.correction_share)(statistics),
+        }
     ts, ys = saved_rows(equations.saveat.subs, batch, run)
     result = outcome.result
     if not equations.solver.corrects_output:

@@ -10,16 +10,19 @@ import jax.tree_util as jtu
 from .._solve.diffeqsolve import diffeqsolve
 from .parts import Inputs
 from .solution import EnsembleSolution
+from .unconstrained import Unconstrained
 
 
 def solve_mapped(inputs: Inputs, lanes: int) -> EnsembleSolution:
     equations, batch = inputs
+    solver = equations.solver
+    solver = solver.inner if isinstance(solver, Unconstrained) else solver
 
     def one(of_each: Any) -> tuple[Any, ...]:
         given = batch.complete(of_each)
         sol = diffeqsolve(
             equations.terms,
-            equations.solver,
+            solver,
             given.t0,
             given.t1,
             equations.dt0,

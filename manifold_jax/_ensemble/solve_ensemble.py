@@ -74,7 +74,7 @@ def solve_ensemble(
     - `throw`: raise a `RuntimeError` if any trajectory fails. By default it has a result code, and
         the others are what they are without it.
 
-    Explicit Runge-Kutta methods with constant steps or `diffrax.PIDController` are advanced so. Other
+    Explicit Runge-Kutta methods, in a hook or alone, with constant steps or `diffrax.PIDController` are advanced so. Other
     solvers, other controllers and systems too large to be written out number by number are solved
     by `diffeqsolve` under `jax.lax.map` in batches of `lanes`. `execution` of the solution says which
     way was taken, and why.

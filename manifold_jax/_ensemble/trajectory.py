@@ -14,9 +14,10 @@ from diffrax import RESULTS
 
 from .._compat import directed, is_okay, nonlinear_failure, update_result
 from .._custom_types import Args, BoolScalar, FloatScalar, IntScalar, RealScalarLike, Y
-from .._solve.prepare import prepare
+from .._solve.prepare import prepare, Ready
 from .._solve.start import Consistent
 from .._solver.advance import HookState, StepStatistics
+from .unconstrained import Unconstrained
 
 
 class Trajectory(NamedTuple):
@@ -84,20 +85,7 @@ class Equations(eqx.Module):
     consistent: Consistent = eqx.field(static=True)
 
     def begin(self, given: Given) -> Start:
-        solver, (t0, t1, y0, args) = self.solver, given
-        ready = prepare(
-            self.terms,
-            solver,
-            t0,
-            t1,
-            self.dt0,
-            y0,
-            args,
-            self.saveat,
-            self.controller,
-            self.consistent,
-            throw=False,
-        )
+        solver, args, ready = self.solver, given.args, self._ready(given)
         terms, direction = self._directed(given)
         t0, t1 = ready.t0 * direction, ready.t1 * direction
         dt0 = None if ready.dt0 is None else ready.dt0 * direction
@@ -115,6 +103,24 @@ class Equations(eqx.Module):
             t0, tnext, ready.y0, solver_state, controller_state, result, zero, zero
         )
         return Start(trajectory, ready.start.correction)
+
+    def _ready(self, given: Given) -> Ready:
+        solver, (t0, t1, y0, args) = self.solver, given
+        if isinstance(solver, Unconstrained):
+            return solver.ready(t0, t1, self.dt0, y0, self.saveat)
+        return prepare(
+            self.terms,
+            solver,
+            t0,
+            t1,
+            self.dt0,
+            y0,
+            args,
+            self.saveat,
+            self.controller,
+            self.consistent,
+            throw=False,
+        )
 
     def goes_on(self, given: Given, trajectory: Trajectory) -> BoolScalar:
         before = trajectory.tprev < given.t1 * given.direction
