@@ -1,5 +1,6 @@
 """Trees of values as lists of columns, one number of each lane or each trajectory."""
 
+import math
 from typing import Any, NamedTuple
 
 import jax
@@ -22,6 +23,10 @@ class Layout(NamedTuple):
         """Of a tree of [`Value`][]s, or of arrays of one trajectory."""
         leaves, treedef = jtu.tree_flatten(tree)
         return Layout(treedef, [x.shape for x in leaves], [x.dtype for x in leaves])
+
+    def dtypes_of_columns(self) -> list[Any]:
+        each = zip(self.shapes, self.dtypes, strict=True)
+        return [dtype for shape, dtype in each for _ in range(math.prod(shape))]
 
     def example(self) -> Any:
         """To trace functions of one trajectory with."""
@@ -77,3 +82,24 @@ def stacked(columns: list[jax.Array]) -> dict[str, jax.Array]:
 def unstacked(stacks: dict[str, jax.Array], dtypes: list[Any]) -> list[jax.Array]:
     rows = {dtype: iter(stack) for dtype, stack in stacks.items()}
     return [next(rows[str(dtype)]) for dtype in dtypes]
+
+
+def empty_table(layout: Layout, rows: int) -> dict[str, jax.Array]:
+    """One array for each type of number, `(rows, columns)`; infinite where numbers can be."""
+    counts: dict[str, int] = {}
+    for shape, dtype in zip(layout.shapes, layout.dtypes, strict=True):
+        counts[str(dtype)] = counts.get(str(dtype), 0) + int(np.prod(shape))
+    unknown = lambda dtype: np.inf if jnp.issubdtype(dtype, jnp.floating) else 0
+    return {dtype: jnp.full((rows, k), unknown(dtype), dtype) for dtype, k in counts.items()}
+
+
+def written(
+    table: dict[str, jax.Array], place: jax.Array, columns: list[jax.Array]
+) -> dict[str, jax.Array]:
+    """Numbers of each lane in a row of their own; none where `place` is behind the last one."""
+    new = stacked(columns)
+    return {dtype: x.at[place].set(new[dtype].T, mode="drop") for dtype, x in table.items()}
+
+
+def read(table: dict[str, jax.Array], place: jax.Array, dtypes: list[Any]) -> list[jax.Array]:
+    return unstacked({dtype: x[place].T for dtype, x in table.items()}, dtypes)

@@ -11,7 +11,7 @@ from jaxtyping import Array
 from .._adjoint.replay import with_memory
 from .._custom_types import BoolScalar, FloatScalar
 from .functions import smooth_of
-from .parts import Inputs, Parts
+from .parts import in_steps, Inputs, Parts
 from .rows import saved_rows
 from .schedule import Run, Schedule
 from .trajectory import Attempt, Outcome, Start, Trajectory
@@ -85,19 +85,27 @@ class Tangents:
         after = Moving(tried.trajectory, tangent)
         return tried._replace(trajectory=after, dense_info=(tried.dense_info, dense_tangent))
 
-    def value(
-        self, given: Given, t: FloatScalar, start: FloatScalar, end: FloatScalar, dense_info: Any
-    ) -> tuple[Any, BoolScalar]:
-        def value(equations, given, dense_info):
-            value, success = equations.value(given, t, start, end, dense_info)
+    def state_of(self, moving: Moving) -> tuple[Any, Any]:
+        return moving.trajectory.y, moving.tangent[0]
+
+    def interpolated(
+        self, t: FloatScalar, start: FloatScalar, end: FloatScalar, dense_info: Any
+    ) -> tuple[Any, Any]:
+        equations = in_steps(self.parts.rest[0])
+        interpolated = lambda info: equations.interpolated(t, start, end, info)
+        return jax.jvp(interpolated, *((info,) for info in dense_info))
+
+    def handed_out(self, given: Given, t: FloatScalar, y: Any) -> tuple[Any, BoolScalar]:
+        def value(equations, given, y):
+            value, success = equations.handed_out(given, t, y)
             return eqx.filter(value, eqx.is_inexact_array), (value, success)
 
-        _, tangent, (value, success) = self._along(value, given, *dense_info)
+        _, tangent, (value, success) = self._along(value, given, *y)
         return (value, tangent), success
 
-    def outcome(self, given: Given, moving: Moving, failed: BoolScalar) -> Ended:
+    def outcome(self, given: Given, moving: Moving) -> Ended:
         equations, primal = self.parts.one(given.each, self.parts.common, given.rest)
-        return Ended(equations.outcome(primal, moving.trajectory, failed), moving.tangent[0])
+        return Ended(equations.outcome(primal, moving.trajectory), moving.tangent[0])
 
 
 def tangents_in_lanes(inputs: Inputs, tangents: Any, lanes: int, limit: int) -> tuple[Any, Any]:
@@ -117,7 +125,7 @@ def tangents_in_lanes(inputs: Inputs, tangents: Any, lanes: int, limit: int) -> 
     def saved(each: Any, common: Any, first: Any, last: Any, values: Any) -> Any:
         equations, batch = parts.inputs(each, common)
         begun = Start(start.trajectory._replace(y=first), run.start.correction)
-        new = Run(begun, outcome._replace(y=last), run.rows, values)
+        new = run._replace(start=begun, outcome=outcome._replace(y=last), values=values)
         return eqx.filter(saved_rows(equations.saveat.subs, batch, new), eqx.is_inexact_array)
 
     at = parts.each, parts.common, start.trajectory.y, outcome.y, values

@@ -72,7 +72,7 @@ class Functions:
         (_, dense_info), pullback = jax.vjp(step, each, common, state)
         return dense_info, pullback
 
-    def through_value(
+    def through_interpolated(
         self,
         each: Any,
         common: Any,
@@ -83,11 +83,19 @@ class Functions:
         dense_info: Any,
         bar: Any,
     ) -> Any:
-        """Cotangents of `each`, `common` and `dense_info`, from that of a value saved at `t`."""
+        """The cotangent of `dense_info`, from that of the state interpolated at `t`."""
+        equations, _ = self.parts.one(each, common, rest)
+        interpolated = lambda info: equations.interpolated(t, start, end, info)
+        return jax.vjp(interpolated, dense_info)[1](bar)[0]
 
-        def value(each: Any, common: Any, dense_info: Any) -> Any:
+    def through_handed_out(
+        self, each: Any, common: Any, rest: Any, t: FloatScalar, y: Any, bar: Any
+    ) -> Any:
+        """Cotangents of `each`, `common` and `y`, from that of what is saved of it at the time `t`."""
+
+        def value(each: Any, common: Any, y: Any) -> Any:
             equations, given = self.parts.one(each, common, rest)
-            value, _ = equations.value(given, t, start, end, dense_info)
+            value, _ = equations.handed_out(given, t, y)
             return eqx.filter(value, eqx.is_inexact_array)
 
-        return jax.vjp(value, each, common, dense_info)[1](bar)
+        return jax.vjp(value, each, common, y)[1](bar)

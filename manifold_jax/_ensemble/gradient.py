@@ -37,7 +37,7 @@ def gradient_in_lanes(
     rows, pullback = jax.vjp(saved, parts.each, parts.common, *handed_out)
     bar = jtu.tree_map(lambda x, b: jnp.zeros_like(x) if b is None else b, rows, bar)
     each, common, *bars = pullback(bar)
-    ends = Ends(run.start.trajectory, run.outcome.num_steps, run.rows, *bars)
+    ends = Ends(run.start.trajectory, run.outcome.num_steps, run.rows, run.states, *bars)
     more = WayBack(parts, ends, lanes, limit).run()
     each, common = jtu.tree_map(jnp.add, (each, common), more)
     return parts.together(each, common)

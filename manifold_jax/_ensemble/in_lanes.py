@@ -5,8 +5,10 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.tree_util as jtu
+from diffrax import RESULTS
 
-from .._compat import update_result
+from .._compat import nonlinear_failure, update_result
+from .._custom_types import BoolScalar
 from .._scalar import NotScalarError
 from .._solve.outcome import result_of_saved
 from .forward import tangents_in_lanes
@@ -50,11 +52,17 @@ def _run(inputs: Inputs, lanes: int) -> tuple[EnsembleSolution, Run]:
             "correction_share": jax.vmap(lambda s: s.correction_share)(statistics),
         }
     ts, ys = saved_rows(equations.saveat.subs, batch, run)
-    result = outcome.result
+    result = jax.vmap(_unless_failed)(outcome.result, run.failed)
     if not equations.solver.corrects_output:
         finite = jax.vmap(lambda ts, ys: result_of_saved(equations.saveat, ts, ys))(ts, ys)
         result = jax.vmap(update_result)(result, finite)
     return EnsembleSolution(ts, ys, stats, result), run
+
+
+def _unless_failed(result: RESULTS, failed: BoolScalar) -> RESULTS:
+    """`failed`: whether a value could not be corrected."""
+    failure = RESULTS.where(failed, nonlinear_failure(), RESULTS.successful)
+    return update_result(result, failure)
 
 
 @solve_in_lanes.def_fwd

@@ -4,7 +4,6 @@ Lanes go together and are not refilled, but hold trajectories of about as many s
 recorded for one segment of the steps at a time; of the others there is the first state.
 """
 
-import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -14,7 +13,16 @@ from jax import lax
 from jaxtyping import Array
 
 from .._scalar import call_in_lanes, example, Lanes, Value
-from .columns import columns_of_arrays, columns_of_values, Layout, stacked, taken, unstacked, where
+from .columns import (
+    columns_of_arrays,
+    columns_of_values,
+    Layout,
+    read,
+    stacked,
+    taken,
+    unstacked,
+    where,
+)
 from .functions import Functions, smooth_of
 from .parts import Parts
 from .trajectory import Trajectory
@@ -26,28 +34,32 @@ _BYTES = 2**22
 
 class Ends(NamedTuple):
     """Of all trajectories, in front of every array: the states they begin with, numbers of steps and of
-    saved rows; cotangents of the first and the last states and of the values at `ts`."""
+    saved rows, and the table of states there (see [`Run`][]); cotangents of the first and the last
+    states and of the values at `ts`."""
 
     start: Trajectory
     num_steps: Array
     rows: Array
+    states: dict[str, Array]
     first_bar: Any
     last_bar: Any
     values_bar: Any
 
 
 class Group(NamedTuple):
-    """Columns of those that go together: which they are, and whether anything depends on them."""
+    """Columns of those that go together: which they are, and whether anything depends on them; the
+    cotangents of their states at `ts`, time by time."""
 
     index: Array
     present: Array
     each: list[Array]
     rest: list[Array]
+    at_times: dict[str, Array]
 
 
 class Bars(NamedTuple):
-    """Columns of cotangents so far, of the state and of what steps depend on; the last row of saved
-    values still to come."""
+    """Columns of cotangents so far, of the state and of what steps depend on; which of the times to
+    save at is the last one still to come."""
 
     state: list[Array]
     each: list[Array]
@@ -72,6 +84,10 @@ class WayBack:
         self.each_layout, self.rest_layout = (_of_one(x) for x in (parts.each, parts.rest_each))
         self.starts, self.state_layout = columns_of_arrays(ends.start), _of_one(ends.start)
         self.smooth_layout = _of_one(smooth_of(ends.start))
+        self.y_layout = _of_one(ends.start.y)
+        self.firsts, self.first_bar, self.last_bar = (
+            columns_of_arrays(x) for x in (ends.start.y, ends.first_bar, ends.last_bar)
+        )
         self.common = jtu.tree_map(Value.of_constant, parts.common)
         self.common_columns = columns_of_values(self.common, self.lanes)  # not in a loop first
         equations = parts.rest[0]
@@ -103,7 +119,7 @@ class WayBack:
 
     def _empty_record(self) -> Record:
         time = self.ends.start.tprev.dtype
-        self.record_dtypes = [time, time, *_dtypes(self.smooth_layout)]
+        self.record_dtypes = [time, time, *self.smooth_layout.dtypes_of_columns()]
         one = stacked([jnp.zeros(self.lanes.count, dtype) for dtype in self.record_dtypes])
         rows = max(_BYTES // sum(x.nbytes for x in one.values()), 1)
         self.rows = min(rows, self.max_steps)
@@ -115,24 +131,45 @@ class WayBack:
         present, index = index < self.size, jnp.minimum(index, self.size - 1)
         with self.lanes.inside(self.starts[0][index]):
             each, rest = taken(self.each, index), taken(self.rest, index)
-            group = Group(index, present & self.needed[index], each, rest)
-            last = taken(columns_of_arrays(self.ends.last_bar), index)
-            zeros = [jnp.zeros(index.size, d) for d in _dtypes(self.smooth_layout)[len(last) :]]
-            none = [jnp.zeros_like(x) for x in each]
-            bars = Bars([*last, *zeros], none, common, self.ends.rows[index] - 1)
+            group = Group(index, present & self.needed[index], each, rest, {})
+            group, bars = self._through_values(group, common)
             bars, record = self._through_segments(group, bars, record)
-            first = taken(columns_of_arrays(self.ends.first_bar), index)
-            bar = [x + y for x, y in zip(bars.state, first, strict=False)] + bars.state[
-                len(first) :
-            ]
-            bar = self.smooth_layout.values(bar)
+            first = taken(self.first_bar, index)
+            y_bar = [x + y for x, y in zip(bars.state, first, strict=False)]
+            bar = self.smooth_layout.values(y_bar + bars.state[len(first) :])
             through = self._call(self.functions.through_start, group, bar)
             bars = self._including(bars, group.present, *through)
             return (record, bars.common), bars.each
 
+    def _through_values(self, group: Group, common: list[Array]) -> tuple[Group, Bars]:
+        """What is handed out at `ts`, time by time, to begin with."""
+        index, last = group.index, taken(self.last_bar, group.index)
+        zeros = [jnp.zeros(index.size, d) for d in self.smooth_layout.dtypes_of_columns()]
+        none = [jnp.zeros_like(x) for x in group.each]
+        rows = self.ends.rows[index]
+        bars = Bars([*last, *zeros[len(last) :]], none, common, rows - 1)
+        if self.ts is None:
+            return group, bars
+        first, dtypes = taken(self.firsts, index), self.y_layout.dtypes_of_columns()
+
+        def at_time(bars: Bars, row: Array) -> tuple[Bars, dict[str, Array]]:
+            place, reached = index * self.ts.size + row, row < rows
+            with self.lanes.inside(first[0]):
+                y = where(reached, read(self.ends.states, place, dtypes), first)
+                bar = self.values_layout.values(taken(self.values_bar, place))
+                t = Layout.of(self.ts[0]).values([jnp.broadcast_to(self.ts[row], reached.shape)])
+                *through, y_bar = self._call(
+                    self.functions.through_handed_out, group, t, self.y_layout.values(y), bar
+                )
+                bars = self._including(bars, group.present & reached, *through)
+                return bars, stacked(columns_of_values(y_bar, self.lanes))
+
+        bars, at_times = lax.scan(at_time, bars, jnp.arange(self.ts.size))
+        return group._replace(at_times=at_times), bars
+
     def _through_segments(self, group: Group, bars: Bars, record: Record) -> tuple[Bars, Record]:
         """On to the last one, storing where each begins, and back."""
-        state, dtypes = taken(self.starts, group.index), _dtypes(self.state_layout)
+        state, dtypes = taken(self.starts, group.index), self.state_layout.dtypes_of_columns()
         segments = -(-self.max_steps // self.rows)
         room = lambda x: jnp.zeros((segments, *x.shape), x.dtype).at[0].set(x)
         firsts = {k: room(x) for k, x in stacked(state).items()}
@@ -215,29 +252,30 @@ class WayBack:
     ) -> tuple[Bars, Any]:
         """The values saved in a step."""
         info, layout = columns_of_values(dense_info, self.lanes), Layout.of(dense_info)
-        time, num_rows = Layout.of(self.ends.start.tprev[0]), self.ts.size
+        time = Layout.of(self.ends.start.tprev[0])
         direction = self._column(self._call(self.functions.direction, group))
         at = lambda row: self.ts.astype(ends[0].dtype)[jnp.maximum(row, 0)] * direction
         due = lambda row: accepted & (row >= 0) & (at(row) > ends[0])
+        lane, dtypes = jnp.arange(group.index.size), self.y_layout.dtypes_of_columns()
 
         def through_row(carry: Any) -> Any:
-            bars, dense_bar = carry
-            here, row = due(bars.row), bars.row
+            row, info_bar = carry
+            here, place = due(row), jnp.maximum(row, 0)
             with self.lanes.inside():
-                place = group.index * num_rows + jnp.maximum(row, 0)
-                bar = self.values_layout.values(taken(self.values_bar, place))
-                times = (time.values([x]) for x in (at(row), *ends))
-                *through, more = self._call(
-                    self.functions.through_value, group, *times, layout.values(info), bar
+                bar = unstacked({d: x[place, :, lane].T for d, x in group.at_times.items()}, dtypes)
+                more = self._call(
+                    self.functions.through_interpolated,
+                    group,
+                    *(time.values([x]) for x in (at(row), *ends)),
+                    layout.values(info),
+                    self.y_layout.values(bar),
                 )
                 more = columns_of_values(more, self.lanes)
-                bars = self._including(bars, here, *through)
-                bars = bars._replace(row=row - here.astype(row.dtype))
-                return bars, _added(dense_bar, more, here)
+                return row - here.astype(row.dtype), _added(info_bar, more, here)
 
-        start = bars, [jnp.zeros_like(x) for x in info]
-        bars, bar = lax.while_loop(lambda c: jnp.any(due(c[0].row)), through_row, start)
-        return bars, layout.values(bar)
+        start = bars.row, [jnp.zeros_like(x) for x in info]
+        row, bar = lax.while_loop(lambda c: jnp.any(due(c[0])), through_row, start)
+        return bars._replace(row=row), layout.values(bar)
 
     def _including(self, bars: Bars, active: Array, each: Any, common: Any) -> Bars:
         each, common = (columns_of_values(x, self.lanes) for x in (each, common))
@@ -255,12 +293,6 @@ class WayBack:
 
 def _of_one(tree: Any) -> Layout:
     return Layout.of(jtu.tree_map(lambda x: example(x.shape[1:], x.dtype), tree))
-
-
-def _dtypes(layout: Layout) -> list[Any]:
-    """Of the columns."""
-    each = zip(layout.shapes, layout.dtypes, strict=True)
-    return [dtype for shape, dtype in each for _ in range(math.prod(shape))]
 
 
 def _with_row(record: Record, row: Array, steps: dict[str, Array], accepted: Array) -> Record:

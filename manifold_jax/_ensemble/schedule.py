@@ -9,7 +9,16 @@ from jax import lax
 from jaxtyping import Array
 
 from .._scalar import call_in_lanes, example, Lanes
-from .columns import columns_of_arrays, columns_of_values, Layout, taken, where
+from .columns import (
+    columns_of_arrays,
+    columns_of_values,
+    empty_table,
+    Layout,
+    read,
+    taken,
+    where,
+    written,
+)
 from .trajectory import Outcome, Start
 
 
@@ -18,35 +27,37 @@ _STEPS = 8
 
 
 class Lane(NamedTuple):
-    """Columns of all lanes: which trajectory each has, its own data and state, the next time to save
-    at, and whether a value could not be corrected."""
+    """Columns of all lanes: which trajectory each has, its own data and state, and the next time to
+    save at."""
 
     number: Array
     given: list[Array]
     state: list[Array]
     row: Array
-    failed: Array
 
 
 class Totals(NamedTuple):
-    """Columns of all trajectories: the outcomes so far, how many rows were saved, and which; the
-    next trajectory to take, and how many have ended."""
+    """Of all trajectories columns of the outcomes so far, how many times to save at were reached, and
+    the table of states there; the next trajectory to take, and how many have ended."""
 
     outcomes: list[Array]
     rows: Array
-    saved: list[Array]
+    states: dict[str, Array]
     next: Array
     ended: Array
 
 
 class Run(NamedTuple):
-    """All trajectories, in front of every array. How many rows of `values`, those at `ts`, each
-    has reached."""
+    """All trajectories, in front of every array. How many of the times to save at each has reached; the
+    states there, as they were interpolated (a table, in its rows the times of one trajectory after
+    those of the other), what was handed out, and whether some of it could not be corrected."""
 
     start: Start
     outcome: Outcome
     rows: Array
+    states: dict[str, Array]
     values: Any
+    failed: Array
 
 
 class Schedule:
@@ -66,25 +77,14 @@ class Schedule:
     def run(self) -> Run:
         starts, corrections, state_layout = self._starts()
         first = jnp.arange(self.count)
-        lane = Lane(
-            first,
-            taken(self.given, first),
-            taken(starts, first),
-            jnp.zeros(self.count, int),
-            jnp.zeros(self.count, bool),
-        )
-        outcome_layout, saved_layout = self._layouts(state_layout)
-        empty = lambda layout, rows: [
-            jnp.full(rows, jnp.inf if jnp.issubdtype(dtype, jnp.floating) else 0, dtype)
-            for shape, dtype in zip(layout.shapes, layout.dtypes, strict=True)
-            for _ in range(_size(shape))
-        ]
-        num_times = 0 if self.ts is None else self.ts.size
-        saved = empty(saved_layout, self.size * num_times) if num_times else []
+        row = jnp.zeros(self.count, int)
+        lane = Lane(first, taken(self.given, first), taken(starts, first), row)
+        outcome_layout, y_layout = self._layouts(state_layout)
+        unknown = empty_table(outcome_layout, self.size)
         totals = Totals(
-            empty(outcome_layout, self.size),
+            read(unknown, jnp.arange(self.size), outcome_layout.dtypes_of_columns()),
             jnp.zeros(self.size, int),
-            saved,
+            {} if self.ts is None else empty_table(y_layout, self.size * self.ts.size),
             jnp.asarray(self.count),
             jnp.asarray(0),
         )
@@ -93,18 +93,17 @@ class Schedule:
             with self.lanes.inside():
                 lane, totals = carry
                 step = lambda carry, _: (self._step(*carry, state_layout), None)
-                (lane, saved), _ = lax.scan(step, (lane, totals.saved), None, length=_STEPS)
-                return self._refill(lane, totals._replace(saved=saved), starts, state_layout)
+                (lane, states), _ = lax.scan(step, (lane, totals.states), None, length=_STEPS)
+                return self._refill(lane, totals._replace(states=states), starts, state_layout)
 
         _, totals = lax.while_loop(lambda c: c[1].ended < self.size, advance, (lane, totals))
-        values = None
-        if num_times:
-            values = jtu.tree_map(
-                lambda x: x.reshape(self.size, num_times, *x.shape[1:]),
-                saved_layout.arrays(totals.saved),
-            )
         start = Start(state_layout.arrays(starts), corrections)
-        return Run(start, outcome_layout.arrays(totals.outcomes), totals.rows, values)
+        values, failed = None, jnp.zeros(self.size, bool)
+        if self.ts is not None:
+            firsts = columns_of_arrays(self.equations.state_of(start.trajectory))
+            values, failed = self._handed_out(totals, firsts, y_layout)
+        outcome = outcome_layout.arrays(totals.outcomes)
+        return Run(start, outcome, totals.rows, totals.states, values, failed)
 
     def _call(self, function: Any, given: list[Array], *args: Any) -> Any:
         of_each = self.given_layout.values(given)
@@ -130,25 +129,51 @@ class Schedule:
         flat = lambda x: x.reshape(-1)[: self.size]
         return [flat(x) for x in starts], flat(correction), layout
 
-    def _layouts(self, state_layout: Layout) -> tuple[Layout, Layout | None]:
-        """Of outcomes and of saved values."""
-        given, state = self.given_layout.example(), state_layout.example()
+    def _layouts(self, state_layout: Layout) -> tuple[Layout, Layout]:
+        """Of outcomes and of states."""
+        given, trajectory = self.given_layout.example(), state_layout.example()
+        outcome = lambda given, trajectory: self.equations.outcome(self.complete(given), trajectory)
+        outcomes = Layout.of(jax.eval_shape(outcome, given, trajectory))
+        return outcomes, Layout.of(self.equations.state_of(trajectory))
 
-        def outcome(given, state):
-            return self.equations.outcome(self.complete(given), state, jnp.asarray(False))
+    def _handed_out(
+        self, totals: Totals, firsts: list[Array], y_layout: Layout
+    ) -> tuple[Any, Array]:
+        """What is saved of the states, time by time; lanes go together."""
+        layout, times = None, self.ts.size
 
-        def value(given, state):
-            given = self.complete(given)
-            attempt = self.equations.attempt(given, state)
-            t = attempt.start
-            return self.equations.value(given, t, t, attempt.end, attempt.dense_info)[0]
+        def of_lanes(index: Array) -> tuple[Array, list[Array]]:
+            given, first, rows = taken(self.given, index), taken(firsts, index), totals.rows[index]
 
-        outcomes = Layout.of(jax.eval_shape(outcome, given, state))
-        if self.ts is None:
-            return outcomes, None
-        return outcomes, Layout.of(jax.eval_shape(value, given, state))
+            def at_time(failed: Array, row: Array) -> tuple[Array, list[Array]]:
+                nonlocal layout
+                reached = row < rows
+                with self.lanes.inside(first[0]):
+                    y = read(totals.states, index * times + row, y_layout.dtypes_of_columns())
+                    y = y_layout.values(where(reached, y, first))
+                    t = Layout.of(self.ts[0]).values(
+                        [jnp.broadcast_to(self.ts[row], reached.shape)]
+                    )
+                    value, success = self._call(self.equations.handed_out, given, t, y)
+                    layout = Layout.of(value)
+                    failed |= reached & ~_column(success, self.lanes)
+                    return failed, columns_of_values(value, self.lanes)
 
-    def _step(self, lane: Lane, saved: list[Array], layout: Layout) -> tuple[Lane, list[Array]]:
+            failed, columns = lax.scan(at_time, jnp.zeros(index.shape, bool), jnp.arange(times))
+            unreached = jnp.arange(times)[:, None] >= rows[None]
+            return failed, [_without(x, unreached) for x in columns]
+
+        pieces = -(-self.size // self.count)
+        index = jnp.minimum(jnp.arange(pieces * self.count), self.size - 1)
+        failed, columns = lax.map(of_lanes, index.reshape(pieces, self.count))
+        by_trajectory = lambda x: jnp.swapaxes(x, 1, 2).reshape(-1, times)[: self.size].ravel()
+        values = layout.arrays([by_trajectory(x) for x in columns])
+        values = jtu.tree_map(lambda x: x.reshape(self.size, times, *x.shape[1:]), values)
+        return values, failed.ravel()[: self.size]
+
+    def _step(
+        self, lane: Lane, states: dict[str, Array], layout: Layout
+    ) -> tuple[Lane, dict[str, Array]]:
         with self.lanes.inside(lane.state[0]):
             state = layout.values(lane.state)
 
@@ -160,58 +185,44 @@ class Schedule:
             active = _column(goes_on, self.lanes) & (lane.number < self.size)
             after = columns_of_values(tried.trajectory, self.lanes)
             if self.ts is not None:
-                lane, saved = self._save(lane, saved, tried, active)
-            return lane._replace(state=where(active, after, lane.state)), saved
+                lane, states = self._save(lane, states, tried, active)
+            return lane._replace(state=where(active, after, lane.state)), states
 
     def _save(
-        self, lane: Lane, saved: list[Array], tried: Any, active: Array
-    ) -> tuple[Lane, list[Array]]:
+        self, lane: Lane, states: dict[str, Array], tried: Any, active: Array
+    ) -> tuple[Lane, dict[str, Array]]:
+        """States at the times in this step. What takes long, their correction, is left for later: here it
+        would be done for all lanes whenever one of them has something to save."""
         kept = active & _column(tried.kept, self.lanes)
         end, start = _column(tried.end, self.lanes), _column(tried.start, self.lanes)
         info_layout = Layout.of(tried.dense_info)
         info = columns_of_values(tried.dense_info, self.lanes)
         direction = _column(self._call(lambda given: given.direction, lane.given), self.lanes)
-        rows = self.ts.size
-
-        def time(row: Array) -> Array:
-            return self.ts[jnp.minimum(row, rows - 1)] * direction
-
-        def due(row: Array) -> Array:
-            return kept & (row < rows) & (time(row) <= end)
+        rows, time = self.ts.size, Layout.of(tried.end)
+        at = lambda row: self.ts[jnp.minimum(row, rows - 1)] * direction
+        due = lambda row: kept & (row < rows) & (at(row) <= end)
 
         def save(carry: Any) -> Any:
-            row, failed, saved = carry
+            row, states = carry
             here = due(row)
             with self.lanes.inside():
-                wrap = Layout.of(tried.end).values
-                value, success = self._call(
-                    self.equations.value,
-                    lane.given,
-                    wrap([time(row)]),
-                    wrap([start]),
-                    wrap([end]),
-                    info_layout.values(info),
-                )
-                columns = columns_of_values(value, self.lanes)
-                failed = failed | (here & ~_column(success, self.lanes))
+                times = (time.values([x]) for x in (at(row), start, end))
+                interpolated = self.equations.interpolated
+                y = call_in_lanes(self.lanes, interpolated, *times, info_layout.values(info))
+                columns = columns_of_values(y, self.lanes)
             place = jnp.where(here, lane.number * rows + row, self.size * rows)
-            saved = [s.at[place].set(x, mode="drop") for s, x in zip(saved, columns, strict=True)]
-            return row + here.astype(row.dtype), failed, saved
+            return row + here.astype(row.dtype), written(states, place, columns)
 
-        row, failed, saved = lax.while_loop(
-            lambda c: jnp.any(due(c[0])), save, (lane.row, lane.failed, saved)
-        )
-        return lane._replace(row=row, failed=failed), saved
+        row, states = lax.while_loop(lambda c: jnp.any(due(c[0])), save, (lane.row, states))
+        return lane._replace(row=row), states
 
     def _refill(
         self, lane: Lane, totals: Totals, starts: list[Array], layout: Layout
     ) -> tuple[Lane, Totals]:
-        state, failed = layout.values(lane.state), Layout.of(jnp.asarray(False))
+        state = layout.values(lane.state)
         goes_on = _column(self._call(self.equations.goes_on, lane.given, state), self.lanes)
         ended = ~goes_on & (lane.number < self.size)
-        outcome = self._call(
-            self.equations.outcome, lane.given, state, failed.values([lane.failed])
-        )
+        outcome = self._call(self.equations.outcome, lane.given, state)
         place = jnp.where(ended, lane.number, self.size)
         outcomes = [
             o.at[place].set(x, mode="drop")
@@ -227,18 +238,17 @@ class Schedule:
             where(fresh, taken(self.given, index), lane.given),
             where(fresh, taken(starts, index), lane.state),
             jnp.where(fresh, 0, lane.row),
-            jnp.where(fresh, False, lane.failed),
         )
         count = jnp.sum(ended)
-        return lane, Totals(outcomes, rows, totals.saved, totals.next + count, totals.ended + count)
+        return lane, Totals(
+            outcomes, rows, totals.states, totals.next + count, totals.ended + count
+        )
 
 
 def _column(value: Any, lanes: Lanes) -> Array:
     return columns_of_values(value, lanes)[0]
 
 
-def _size(shape: tuple[int, ...]) -> int:
-    size = 1
-    for length in shape:
-        size *= length
-    return size
+def _without(x: Array, unreached: Array) -> Array:
+    unknown = jnp.inf if jnp.issubdtype(x.dtype, jnp.floating) else 0
+    return jnp.where(unreached, jnp.asarray(unknown, x.dtype), x)

@@ -163,12 +163,17 @@ class Equations(eqx.Module):
         )
         return Attempt(after, kept, before.tprev, end, dense_info)
 
-    def value(
-        self, given: Given, t: FloatScalar, start: FloatScalar, end: FloatScalar, dense_info: Any
-    ) -> tuple[Any, BoolScalar]:
-        """What is saved at `t` inside a step, and whether it is on the manifold."""
-        interpolation = self.solver.interpolation_cls(t0=start, t1=end, **dense_info)
-        t, y = t * given.direction, interpolation.evaluate(t)
+    def state_of(self, trajectory: Trajectory) -> Y:
+        return trajectory.y
+
+    def interpolated(
+        self, t: FloatScalar, start: FloatScalar, end: FloatScalar, dense_info: Any
+    ) -> Y:
+        """The state inside a step, as the solver interpolates it. Times increase."""
+        return self.solver.interpolation_cls(t0=start, t1=end, **dense_info).evaluate(t)
+
+    def handed_out(self, given: Given, t: FloatScalar, y: Y) -> tuple[Any, BoolScalar]:
+        """What is saved of such a state, and whether it is on the manifold. `t` is the true time."""
         success = jnp.asarray(True)
         if self.solver.corrects_output:
             y, info = self.solver.correct(t, y, given.args)
@@ -176,18 +181,16 @@ class Equations(eqx.Module):
             y = jtu.tree_map(lambda leaf: jnp.where(success, leaf, jnp.nan), y)
         return self.saveat.subs.fn(t, y, given.args), success
 
-    def outcome(self, given: Given, trajectory: Trajectory, failed: BoolScalar) -> Outcome:
-        """`failed`: whether a value could not be corrected."""
+    def outcome(self, given: Given, trajectory: Trajectory) -> Outcome:
         result = trajectory.result
         unfinished = (trajectory.tprev < given.t1 * given.direction) & self._successful(trajectory)
         result = RESULTS.where(unfinished, RESULTS.max_steps_reached, result)
         result = update_result(result, trajectory.solver_state.result)
-        output = RESULTS.where(failed, nonlinear_failure(), RESULTS.successful)
         t = trajectory.tprev * given.direction
         return Outcome(
             t,
             trajectory.y,
-            update_result(result, output),
+            result,
             trajectory.num_steps,
             trajectory.num_accepted,
             trajectory.solver_state.statistics,
