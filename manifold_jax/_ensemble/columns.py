@@ -24,6 +24,11 @@ class Layout(NamedTuple):
         leaves, treedef = jtu.tree_flatten(tree)
         return Layout(treedef, [x.shape for x in leaves], [x.dtype for x in leaves])
 
+    @staticmethod
+    def of_one(tree: Any) -> "Layout":
+        """Of one of the trajectories that arrays have in front."""
+        return Layout.of(jtu.tree_map(lambda x: example(x.shape[1:], x.dtype), tree))
+
     def dtypes_of_columns(self) -> list[Any]:
         each = zip(self.shapes, self.dtypes, strict=True)
         return [dtype for shape, dtype in each for _ in range(math.prod(shape))]
@@ -69,6 +74,10 @@ def taken(columns: list[jax.Array], index: jax.Array) -> list[jax.Array]:
 
 def where(chosen: jax.Array, a: list[jax.Array], b: list[jax.Array]) -> list[jax.Array]:
     return [jax.lax.select(chosen, x, y) for x, y in zip(a, b, strict=True)]
+
+
+def added(totals: list[jax.Array], more: list[jax.Array], active: jax.Array) -> list[jax.Array]:
+    return [a + jnp.where(active, b, 0) for a, b in zip(totals, more, strict=True)]
 
 
 def stacked(columns: list[jax.Array]) -> dict[str, jax.Array]:

@@ -5,15 +5,16 @@ recorded for one segment of the steps at a time; of the others there is the firs
 """
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax.numpy as jnp
 import jax.tree_util as jtu
 from jax import lax
 from jaxtyping import Array
 
-from .._scalar import call_in_lanes, example, Lanes, Value
+from .._scalar import call_in_lanes, Lanes, Value
 from .columns import (
+    added,
     columns_of_arrays,
     columns_of_values,
     Layout,
@@ -25,53 +26,11 @@ from .columns import (
 )
 from .functions import Functions, smooth_of
 from .parts import Parts
-from .trajectory import Trajectory
+from .records import Bars, Ends, Group, Record
 
 
 # Of the record of a segment.
 _BYTES = 2**22
-
-
-class Ends(NamedTuple):
-    """Of all trajectories, in front of every array: the states they begin with, numbers of steps and of
-    saved rows, and the table of states there (see [`Run`][]); cotangents of the first and the last
-    states and of the values at `ts`."""
-
-    start: Trajectory
-    num_steps: Array
-    rows: Array
-    states: dict[str, Array]
-    first_bar: Any
-    last_bar: Any
-    values_bar: Any
-
-
-class Group(NamedTuple):
-    """Columns of those that go together: which they are, and whether anything depends on them; the
-    cotangents of their states at `ts`, time by time."""
-
-    index: Array
-    present: Array
-    each: list[Array]
-    rest: list[Array]
-    at_times: dict[str, Array]
-
-
-class Bars(NamedTuple):
-    """Columns of cotangents so far, of the state and of what steps depend on; which of the times to
-    save at is the last one still to come."""
-
-    state: list[Array]
-    each: list[Array]
-    common: list[Array]
-    row: Array
-
-
-class Record(NamedTuple):
-    """Of the steps of a segment: where they begin and end, from which state; which were accepted."""
-
-    steps: dict[str, Array]
-    accepted: Array
 
 
 class WayBack:
@@ -81,10 +40,12 @@ class WayBack:
         self.size = ends.num_steps.size
         self.lanes = Lanes(min(lanes, self.size), limit)
         self.each, self.rest = (columns_of_arrays(x) for x in (parts.each, parts.rest_each))
-        self.each_layout, self.rest_layout = (_of_one(x) for x in (parts.each, parts.rest_each))
-        self.starts, self.state_layout = columns_of_arrays(ends.start), _of_one(ends.start)
-        self.smooth_layout = _of_one(smooth_of(ends.start))
-        self.y_layout = _of_one(ends.start.y)
+        self.each_layout, self.rest_layout = (
+            Layout.of_one(x) for x in (parts.each, parts.rest_each)
+        )
+        self.starts, self.state_layout = columns_of_arrays(ends.start), Layout.of_one(ends.start)
+        self.smooth_layout = Layout.of_one(smooth_of(ends.start))
+        self.y_layout = Layout.of_one(ends.start.y)
         self.firsts, self.first_bar, self.last_bar = (
             columns_of_arrays(x) for x in (ends.start.y, ends.first_bar, ends.last_bar)
         )
@@ -93,7 +54,7 @@ class WayBack:
         equations = parts.rest[0]
         self.max_steps, self.ts = equations.max_steps, equations.saveat.subs.ts
         rows = jtu.tree_map(lambda x: x.reshape(-1, *x.shape[2:]), ends.values_bar)
-        self.values_bar, self.values_layout = columns_of_arrays(rows), _of_one(rows)
+        self.values_bar, self.values_layout = columns_of_arrays(rows), Layout.of_one(rows)
         self.needed = self._needed()
 
     def run(self) -> tuple[Any, Any]:
@@ -204,7 +165,7 @@ class WayBack:
                 tried = self._call(self.functions.attempt, group, before)
                 x = columns_of_values((before.tprev, before.tnext, smooth_of(before)), self.lanes)
                 accepted = active & self._column(tried.kept)
-                record = _with_row(record, row, stacked(x), accepted)
+                record = record.with_row(row, x, accepted)
                 state = where(active, columns_of_values(tried.trajectory, self.lanes), state)
                 return row + 1, goes_on(state), state, record
 
@@ -271,7 +232,7 @@ class WayBack:
                     self.y_layout.values(bar),
                 )
                 more = columns_of_values(more, self.lanes)
-                return row - here.astype(row.dtype), _added(info_bar, more, here)
+                return row - here.astype(row.dtype), added(info_bar, more, here)
 
         start = bars.row, [jnp.zeros_like(x) for x in info]
         row, bar = lax.while_loop(lambda c: jnp.any(due(c[0])), through_row, start)
@@ -280,7 +241,7 @@ class WayBack:
     def _including(self, bars: Bars, active: Array, each: Any, common: Any) -> Bars:
         each, common = (columns_of_values(x, self.lanes) for x in (each, common))
         return bars._replace(
-            each=_added(bars.each, each, active), common=_added(bars.common, common, active)
+            each=added(bars.each, each, active), common=added(bars.common, common, active)
         )
 
     def _call(self, function: Callable, group: Group, *args: Any) -> Any:
@@ -289,16 +250,3 @@ class WayBack:
 
     def _column(self, value: Any) -> Array:
         return columns_of_values(value, self.lanes)[0]
-
-
-def _of_one(tree: Any) -> Layout:
-    return Layout.of(jtu.tree_map(lambda x: example(x.shape[1:], x.dtype), tree))
-
-
-def _with_row(record: Record, row: Array, steps: dict[str, Array], accepted: Array) -> Record:
-    steps = {dtype: x.at[row].set(steps[dtype]) for dtype, x in record.steps.items()}
-    return Record(steps, record.accepted.at[row].set(accepted))
-
-
-def _added(totals: list[Array], more: list[Array], active: Array) -> list[Array]:
-    return [a + jnp.where(active, b, 0) for a, b in zip(totals, more, strict=True)]

@@ -8,7 +8,7 @@ import jax.tree_util as jtu
 from jax import lax
 from jaxtyping import Array
 
-from .._scalar import call_in_lanes, example, Lanes
+from .._scalar import call_in_lanes, Lanes
 from .columns import (
     columns_of_arrays,
     columns_of_values,
@@ -71,7 +71,7 @@ class Schedule:
         self.count = min(lanes, self.size)
         self.lanes = Lanes(self.count, limit)
         self.given = columns_of_arrays(given)
-        self.given_layout = Layout.of(jtu.tree_map(lambda x: example(x.shape[1:], x.dtype), given))
+        self.given_layout = Layout.of_one(given)
         self.ts = equations.saveat.subs.ts
 
     def run(self) -> Run:
