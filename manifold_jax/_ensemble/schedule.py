@@ -10,7 +10,7 @@ from jaxtyping import Array
 
 from .._scalar import call_in_lanes, example, Lanes
 from .columns import columns_of_arrays, columns_of_values, Layout, taken, where
-from .trajectory import Outcome, Start
+from .trajectory import Start
 
 
 # Steps between two looks at which lanes have ended. A lane waits half of them on average.
@@ -43,8 +43,8 @@ class Run(NamedTuple):
     """All trajectories, in front of every array. How many rows of `values`, those at `ts`, each
     has reached."""
 
-    start: Start
-    outcome: Outcome
+    start: Any  # `Start` and `Outcome`, or what the equations have in their place
+    outcome: Any
     rows: Array
     values: Any
 
@@ -92,7 +92,7 @@ class Schedule:
         def advance(carry: tuple[Lane, Totals]) -> tuple[Lane, Totals]:
             with self.lanes.inside():
                 lane, totals = carry
-                step = lambda carry, _: (self._step(*carry, state_layout), None)
+                step = lambda carry, _: (self._step(*carry, state_layout), None)  # pyright: ignore[reportCallIssue]
                 (lane, saved), _ = lax.scan(step, (lane, totals.saved), None, length=_STEPS)
                 return self._refill(lane, totals._replace(saved=saved), starts, state_layout)
 
@@ -101,7 +101,7 @@ class Schedule:
         if num_times:
             values = jtu.tree_map(
                 lambda x: x.reshape(self.size, num_times, *x.shape[1:]),
-                saved_layout.arrays(totals.saved),
+                saved_layout.arrays(totals.saved),  # pyright: ignore[reportOptionalMemberAccess]
             )
         start = Start(state_layout.arrays(starts), corrections)
         return Run(start, outcome_layout.arrays(totals.outcomes), totals.rows, values)
@@ -128,7 +128,7 @@ class Schedule:
         index = jnp.minimum(jnp.arange(pieces * self.count), self.size - 1)
         starts, (correction,) = lax.map(begin, index.reshape(pieces, self.count))
         flat = lambda x: x.reshape(-1)[: self.size]
-        return [flat(x) for x in starts], flat(correction), layout
+        return [flat(x) for x in starts], flat(correction), layout  # pyright: ignore[reportReturnType]
 
     def _layouts(self, state_layout: Layout) -> tuple[Layout, Layout | None]:
         """Of outcomes and of saved values."""
