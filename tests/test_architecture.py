@@ -44,7 +44,7 @@ LAYERS = [
     {"problems"},
     {"__init__"},
     {"_compare"},
-    {"_certify"},
+    {"_animate", "_certify"},
     {"_cli"},
     {"__main__"},
 ]

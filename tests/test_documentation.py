@@ -1,14 +1,15 @@
 """The site has a place for everything."""
 
 import re
-from pathlib import Path
+import subprocess
+import sys
 
 import pytest
+from documents import blocks_of, ROOT, run
 
 import manifold_jax as mj
 
 
-ROOT = Path(__file__).parents[1]
 PAGES = ROOT / "docs" / "pages"
 
 
@@ -33,3 +34,27 @@ def test_every_notebook_is_a_page():
     navigation = (ROOT / "docs" / "mkdocs.yml").read_text()
     for path in (ROOT / "notebooks").glob("*.ipynb"):
         assert f"- notebooks/{path.name}\n" in navigation
+
+
+# The others compile for longer.
+QUICK = {"failing-trajectories", "extending"}
+# What is set before JAX and Equinox are imported.
+ALONE = {"export", "single-precision"}
+
+
+@pytest.mark.parametrize(
+    "page",
+    [
+        pytest.param(page, id=page.stem, marks=() if page.stem in QUICK else pytest.mark.slow)
+        for page in sorted(PAGES.rglob("*.md"))
+        if blocks_of(page)
+    ],
+)
+def test_examples_of_a_page_run_one_after_the_other(page, tmp_path, monkeypatch):
+    """They assert by themselves what the text says."""
+    monkeypatch.chdir(tmp_path)
+    if page.stem in ALONE:
+        script = "\n".join(blocks_of(page))
+        subprocess.run([sys.executable, "-W", "error", "-c", script], check=True)
+    else:
+        run(*blocks_of(page))
