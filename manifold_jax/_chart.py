@@ -118,7 +118,9 @@ class TangentSpaceChart(AbstractChart):
 
     def at(self, constraint, projection, t, y, args) -> AbstractCoordinates:
         directions = constraint.normals(projection, t, y, args).directions
-        return _Representatives(constraint, projection, directions, y)
+        return _Representatives(
+            constraint=constraint, projection=projection, directions=directions, origin=y
+        )
 
     def check(self, constraint: AbstractConstraint) -> None:
         _refuse_redundant(constraint)
@@ -138,7 +140,9 @@ class CoordinatePartitionChart(AbstractChart):
     def at(self, constraint, projection, t, y, args) -> AbstractCoordinates:
         G = constraint.normals(projection, t, y, args).jacobian
         directions = G * dependent_coordinates(G)[None, :]
-        return _Representatives(constraint, projection, directions, y)
+        return _Representatives(
+            constraint=constraint, projection=projection, directions=directions, origin=y
+        )
 
     def check(self, constraint: AbstractConstraint) -> None:
         _refuse_redundant(constraint)

@@ -50,7 +50,7 @@ def time_direction(terms: PyTree) -> RealScalarLike:
 def directed(terms: PyTree, direction: RealScalarLike) -> PyTree:
     """Terms in the time in which Diffrax integrates, `t * direction`."""
     is_leaf = lambda x: isinstance(x, AbstractTerm) and not isinstance(x, MultiTerm)
-    return jtu.tree_map(lambda term: WrapTerm(term, direction), terms, is_leaf=is_leaf)
+    return jtu.tree_map(lambda term: WrapTerm(term, direction), terms, is_leaf=is_leaf)  # pyright: ignore[reportArgumentType]
 
 
 def undirected(terms: PyTree) -> PyTree:
@@ -64,7 +64,7 @@ def nonlinear_failure() -> RESULTS:
     Result codes cannot be added from outside Diffrax; this is what its implicit solvers
     return when their equations cannot be solved.
     """
-    return RESULTS.nonlinear_divergence
+    return RESULTS.nonlinear_divergence  # pyright: ignore[reportReturnType]
 
 
 def number_of_result(result: RESULTS) -> Any:

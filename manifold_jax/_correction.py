@@ -204,8 +204,8 @@ def _solve_jvp(primals, tangents):
     equations = equations.starting_at(jnp.where(root.success, equations.x, safe))
     z = jnp.where(root.success, root.z, 0)
     dz, moved, crossing = implicit_tangent(equations, tangents[0], z)
-    p_dot = moved + combine(dz, crossing.normals.directions)
-    return root, CorrectionRoot(p_dot, dz, None, jnp.zeros_like(root.residual), None, None)
+    p_dot = moved + combine(dz, crossing.normals.directions)  # pyright: ignore[reportAttributeAccessIssue]
+    return root, CorrectionRoot(p_dot, dz, None, jnp.zeros_like(root.residual), None, None)  # pyright: ignore[reportArgumentType]
 
 
 def equations_of(

@@ -3,17 +3,20 @@
 import functools
 import inspect
 from collections.abc import Callable
-from typing import Any
+from typing import Any, cast, TypeVar
 
 import diffrax as dfx
 import equinox as eqx
 
 
-def clear_errors(function: Callable) -> Callable:
+Function = TypeVar("Function", bound=Callable)
+
+
+def clear_errors(function: Function) -> Function:
     """Around a function made by `equinox.filter_jit`: the message of an error comes last, where it
     is looked for, a call with the wrong arguments is told the right ones, and one that is
     differentiated forwards what to write for that."""
-    signature = inspect.signature(function)
+    signature, name = inspect.signature(function), getattr(function, "__name__", "")
 
     @functools.wraps(function)
     def call(*args: Any, **kwargs: Any) -> Any:
@@ -23,12 +26,12 @@ def clear_errors(function: Callable) -> Callable:
         except eqx.EquinoxRuntimeError as error:
             raise eqx.EquinoxRuntimeError(_message_last(str(error))) from None
         except TypeError as error:
-            _check_call(function.__name__, signature, args, kwargs)
+            _check_call(name, signature, args, kwargs)
             if "custom_vjp" in str(error) and _is_reverse(signature.parameters, kwargs):
                 raise TypeError(_FORWARDS) from error
             raise
 
-    return call
+    return cast(Function, call)  # an editor sees the arguments
 
 
 _FORWARDS = (

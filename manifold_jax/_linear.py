@@ -100,7 +100,7 @@ _SMALLEST_INVERSE = 3
 def factorize_once(A: Float[Array, "m m"]) -> "Factorization | Inverse":
     """For what is evaluated once in a step, or in a solve."""
     if not _SMALLEST_INVERSE <= A.shape[0] <= UNROLL_LIMIT:
-        return factorize(A)
+        return factorize(A)  # pyright: ignore[reportReturnType]
     return Inverse(*_invert(A))
 
 
@@ -119,7 +119,7 @@ def _invert(A: Float[Array, "m m"]) -> tuple[Float[Array, "m m"], BoolScalar]:
     return A, full_rank
 
 
-@_invert.defjvp
+@_invert.defjvp  # pyright: ignore[reportArgumentType]
 def _invert_jvp(primals, tangents):
     (A,), (A_dot,) = primals, tangents
     X, full_rank = _invert(A)
@@ -217,14 +217,14 @@ def gram_written_out(A: Float[Array, "i n"], B: Float[Array, "k n"]) -> Float[Ar
     for which XLA calls a library if the batch is large, and which then do not fuse."""
     if max(*A.shape, B.shape[0]) > UNROLL_LIMIT:
         return gram(A, B)
-    return sum(A[:, None, j] * B[None, :, j] for j in range(A.shape[1]))
+    return sum(A[:, None, j] * B[None, :, j] for j in range(A.shape[1]))  # pyright: ignore[reportReturnType]
 
 
 def combine(weights: Float[Array, " m"], rows: Float[Array, "m n"]) -> Float[Array, " n"]:
     """`sum_i weights_i rows_i`."""
     if rows.shape[0] > UNROLL_LIMIT:
         return weights @ rows
-    return sum(weights[i] * rows[i] for i in range(rows.shape[0]))
+    return sum(weights[i] * rows[i] for i in range(rows.shape[0]))  # pyright: ignore[reportReturnType]
 
 
 def multiply(A: Float[Array, "m n"], x: Float[Array, " n"]) -> Float[Array, " m"]:

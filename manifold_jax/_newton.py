@@ -73,7 +73,7 @@ class _Search(NamedTuple):
         best = jtu.tree_map(
             lambda new, old: jnp.where(progress, new, old), (z, r, level), state[:3]
         )
-        return Iterate(*best, state.iterations + 1, progress)
+        return Iterate(*best, state.iterations + 1, progress)  # pyright: ignore[reportCallIssue]
 
 
 # Scaled residual, in rounding units, at which nothing more can be gained. At 4 units the

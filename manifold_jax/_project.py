@@ -1,6 +1,7 @@
 """Moving one point onto the manifold: any point, and initial values."""
 
 import dataclasses
+from typing import TypeVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -15,17 +16,20 @@ from ._projection import NewtonProjection
 from ._projection_info import ProjectionInfo
 
 
+State = TypeVar("State")  # of the same structure goes in and comes out
+
+
 @clear_errors
 @eqx.filter_jit
 def project(
     constraint: AbstractConstraint,
     t: RealScalarLike,
-    y: Y,
+    y: State,
     args: Args = None,
     *,
     projection: NewtonProjection | None = None,
     throw: bool = True,
-) -> tuple[Y, ProjectionInfo]:
+) -> tuple[State, ProjectionInfo]:
     """Move one point onto the manifold, `p = y + W^-1 G(y)^T z` with `g(t, p, args) = 0`.
 
     **Arguments:**
@@ -64,12 +68,12 @@ def project(
 def consistent_state(
     constraint: AbstractConstraint,
     t: RealScalarLike,
-    y: Y,
+    y: State,
     args: Args = None,
     *,
     projection: NewtonProjection | None = None,
     throw: bool = True,
-) -> tuple[Y, ProjectionInfo]:
+) -> tuple[State, ProjectionInfo]:
     """Make an initial value consistent: move it onto the manifold, or say why that failed.
 
     **Arguments:**

@@ -4,6 +4,7 @@ from typing import Any, Literal
 
 import equinox as eqx
 import jax
+import jax.core
 import jax.flatten_util as jfu
 import jax.numpy as jnp
 import jax.tree_util as jtu

@@ -6,6 +6,7 @@ from typing import Any
 
 import equinox as eqx
 import jax
+import jax.core
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
@@ -98,5 +99,5 @@ def _is_known(value: Any) -> bool:
 
 
 def _number(value: Any) -> str:
-    short = {"float_kind": lambda x: f"{x + 0.0:.3g}"}
+    short: Any = {"float_kind": lambda x: f"{x + 0.0:.3g}"}
     return np.array2string(np.asarray(value), separator=", ", threshold=20, formatter=short)

@@ -124,7 +124,7 @@ class _LastStep:
             return jnp.where(changed, there, self.end - t)
 
         options = dict(lower=self.start, upper=self.end)
-        root = optx.root_find(value, self.root_finder, self.end, options=options, throw=False)
+        root = optx.root_find(value, self.root_finder, self.end, options=options, throw=False)  # pyright: ignore[reportArgumentType]
         return root.value, root.result
 
 
@@ -143,7 +143,7 @@ def _ending(
     def saved(sub: dfx.SubSaveAt, state: SaveState) -> SaveState:
         value = sub.fn(t, y, last_step.args)
         empty = jnp.inf * time_direction(last_step.given["terms"])
-        return _saved_until(sub, state, num_accepted, (t, value), (empty, jnp.inf))
+        return _saved_until(sub, state, num_accepted, (t, value), (empty, jnp.inf))  # pyright: ignore[reportArgumentType]
 
     is_sub = lambda x: isinstance(x, dfx.SubSaveAt)
     save_state = jtu.tree_map(saved, saveat.subs, old.save_state, is_leaf=is_sub)

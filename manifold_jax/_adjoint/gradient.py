@@ -56,6 +56,7 @@ class Gradient(NamedTuple):
             return self
         start_bar, end_bar = times_bar
         bars = self.times
+        assert bars is not None
         t0 = bars.t0 + jnp.where(step.start == ends.t0, start_bar, 0)
         t1 = bars.t1 + jnp.where(step.end == ends.t1, end_bar, 0)
         return self._replace(times=bars._replace(t0=t0, t1=t1))
@@ -63,14 +64,19 @@ class Gradient(NamedTuple):
     def at_end_of_solve(self, ends: Ends, t: Any, bar: FloatScalar) -> "Gradient":
         """A value saved at `t`, if that is one of the ends."""
         bars = self.times
+        assert bars is not None
         at_start = t == ends.t0
         t0 = bars.t0 + jnp.where(at_start, bar, 0)
         t1 = bars.t1 + jnp.where((t == ends.t1) & ~at_start, bar, 0)
         return self._replace(times=bars._replace(t0=t0, t1=t1))
 
     def at_saved_time(self, k: int, i: IntScalar, bar: FloatScalar) -> "Gradient":
-        ts = replaced(self.times.ts, k, self.times.ts[k].at[i].add(bar))
-        return self._replace(times=self.times._replace(ts=ts))
+        bars = self.times
+        assert bars is not None
+        of_saving = bars.ts[k]
+        assert of_saving is not None
+        ts = replaced(bars.ts, k, of_saving.at[i].add(bar))
+        return self._replace(times=bars._replace(ts=ts))
 
 
 def add(a: Any, b: Any) -> Any:

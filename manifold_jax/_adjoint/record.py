@@ -89,12 +89,12 @@ class Record(eqx.Module):
         sizes = self.sizes
         block, within = i // sizes.block, i % sizes.block
         segment, begins = block // sizes.segment, (block % sizes.segment == 0) & (within == 0)
-        firsts = {k: buffer_at_set(b, segment, x[k], pred=begins) for k, b in self.firsts.items()}
+        firsts = {k: buffer_at_set(b, segment, x[k], pred=begins) for k, b in self.firsts.items()}  # pyright: ignore[reportArgumentType]
         at = jnp.minimum(block, sizes.kept - 1), within
         is_kept = block < sizes.kept
-        states = {k: buffer_at_set(b, at, x[k], pred=is_kept) for k, b in self.states.items()}
+        states = {k: buffer_at_set(b, at, x[k], pred=is_kept) for k, b in self.states.items()}  # pyright: ignore[reportArgumentType]
         times = buffer_at_set(self.times, (block, within), row)
-        return Record(times, states, firsts, self.packing, sizes)
+        return Record(times, states, firsts, self.packing, sizes)  # pyright: ignore[reportArgumentType]
 
 
 def recording(record: Record, of: Callable[[Any], Any], run: Callable) -> tuple[Any, Record]:

@@ -132,7 +132,7 @@ class SavedValues(eqx.Module):
 
             def value(leaves: Any, dense_info: Any, times: Any) -> Any:
                 t, start, end = times or (rows.times[row], step.start, step.end)
-                saved = self.functions.at(leaves).savings[k].in_step(t, start, end, dense_info)
+                saved = self.functions.at(leaves).savings[k].in_step(t, start, end, dense_info)  # pyright: ignore[reportOptionalCall]
                 return eqx.filter(saved, eqx.is_inexact_array)
 
             times = (rows.times[row], step.start, step.end)

@@ -211,7 +211,7 @@ def _backward(residuals, cotangents, perturbed, differentiable, record, remember
         ),
     )
     gradient = back.run(bar.state, timed=any(jtu.tree_leaves(perturbed[2])))
-    times = gradient.times or TimesBar(None, None, [None] * len(ts))
+    times = gradient.times or TimesBar(None, None, [None] * len(ts))  # pyright: ignore[reportArgumentType]
     if gradient.times is not None and bar.dense_ts is not None:
         at = lambda t: jnp.sum(jnp.where(handed_out.dense_ts == t, bar.dense_ts, 0))
         times = times._replace(t0=times.t0 + at(t0), t1=times.t1 + at(t1))

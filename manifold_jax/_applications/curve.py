@@ -146,12 +146,12 @@ def trace_curve(
     used, smooth = unbroken(nodes, rtol, atol)
     usable = positive & ~jnp.any(faults)
     used = jnp.where(usable, used, 0)
-    turns = find_turns(curve, sol.interpolation, nodes, used, parameter, max_turning_points)
+    turns = find_turns(curve, sol.interpolation, nodes, used, parameter, max_turning_points)  # pyright: ignore[reportArgumentType]
 
     reached = smooth | (arclengths <= nodes.s[jnp.maximum(used - 1, 0)])
-    valid = (usable & reached & jnp.isfinite(sol.ts[0]))[:, None]
+    valid = (usable & reached & jnp.isfinite(sol.ts[0]))[:, None]  # pyright: ignore[reportOptionalSubscript]
     # Replaced before the tangent is taken, as the derivative of a NaN is never zero.
-    x = jnp.where(valid, sol.ys[0], start)
+    x = jnp.where(valid, sol.ys[0], start)  # pyright: ignore[reportOptionalSubscript]
     faults = jnp.concatenate([faults, jnp.stack([~positive, ~smooth])])
     trace = CurveTrace(
         arclengths,

@@ -115,7 +115,7 @@ def follow(
         consistent="assume",
         **options,
     )
-    return sol, sol.ys[1]
+    return sol, sol.ys[1]  # pyright: ignore[reportOptionalSubscript]
 
 
 def unbroken(

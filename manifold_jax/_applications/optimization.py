@@ -165,7 +165,7 @@ def gradient_flow(
     arrived = sol.result == RESULTS.event_occurred
     unfinished = sol.result == RESULTS.successful
     result = RESULTS.where(arrived, RESULTS.successful, sol.result)
-    result = RESULTS.where(unfinished, RESULTS.nonlinear_max_steps_reached, result)
+    result = RESULTS.where(unfinished, RESULTS.nonlinear_max_steps_reached, result)  # pyright: ignore[reportArgumentType]
     result = RESULTS.where(usable, result, nonlinear_failure())
     reach = jnp.where(usable & arrived, tolerance**0.5, 0.0)
     minimum = _describe(lagrangian, sol, unravel, reach, size, result)
@@ -230,7 +230,7 @@ def _describe(
     size: FloatScalar,
     result: RESULTS,
 ) -> ConstrainedMinimum:
-    x, multipliers, curvature, is_minimum = stationary_point(lagrangian, sol.ys[-1], reach, size)
+    x, multipliers, curvature, is_minimum = stationary_point(lagrangian, sol.ys[-1], reach, size)  # pyright: ignore[reportOptionalSubscript]
     return ConstrainedMinimum(
         x=unravel(x),
         multipliers=multipliers,
@@ -239,7 +239,7 @@ def _describe(
         stationarity=jnp.max(jnp.abs(jax.grad(lagrangian)(x, multipliers))),
         curvature=curvature,
         is_minimum=is_okay(result) & is_minimum,
-        flow_time=sol.ts[-1],
+        flow_time=sol.ts[-1],  # pyright: ignore[reportOptionalSubscript]
         result=result,
         stats=sol.stats,
     )

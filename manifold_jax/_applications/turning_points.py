@@ -53,9 +53,9 @@ def find_turns(
     def locate(step, found):
         ends = tuple(jnp.where(found, nodes.s[step + i], 0) for i in range(2))
         fixed = without_derivative((curve, path))
-        root = _bracketed_root(lambda s: slope(*fixed, s), ends, (slopes[step], slopes[step + 1]))
+        root = _bracketed_root(lambda s: slope(*fixed, s), ends, (slopes[step], slopes[step + 1]))  # pyright: ignore[reportArgumentType, reportCallIssue]
         root = jax.lax.stop_gradient(root)
-        _, rate = jax.jvp(lambda s: slope(*fixed, s), (root,), (jnp.ones_like(root),))
+        _, rate = jax.jvp(lambda s: slope(*fixed, s), (root,), (jnp.ones_like(root),))  # pyright: ignore[reportCallIssue]
         correction = slope(curve, path, root) / jnp.where(found, rate, 1)
         s = root - jnp.where(found, correction, 0)
         return s, path.evaluate(s)

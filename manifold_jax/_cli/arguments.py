@@ -9,6 +9,8 @@ from typing import Any, TYPE_CHECKING, TypeVar
 
 import typer
 
+from .._extras import require
+
 
 if TYPE_CHECKING:
     from .._compare.approaches import Approach
@@ -101,12 +103,20 @@ def model_at(place: str) -> tuple[Any, Any, Any, int]:
         )
     F, x, *further = model
     args, order = (*further, *(None, 1)[len(further) :])
-    return F, x, args, order
+    return F, x, args, order  # pyright: ignore[reportReturnType]
 
 
 def check_positive(value: float, option: str) -> None:
     if not (math.isfinite(value) and value > 0):
         raise typer.BadParameter(f"must be a positive number, got {value}.", param_hint=option)
+
+
+def check_can_draw(path: Path | None, option: str) -> None:
+    try:
+        if path is not None:
+            require("matplotlib", "cli", "A picture")
+    except ImportError as error:
+        raise typer.BadParameter(str(error), param_hint=option) from error
 
 
 def check_target(path: Path | None, option: str, suffixes: tuple[str, ...] | None) -> None:

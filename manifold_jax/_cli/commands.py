@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 
 from .arguments import (
+    check_can_draw,
     check_positive,
     check_target,
     choose,
@@ -124,6 +125,7 @@ def compare(
     chosen, left_out = choose(methods, {method.key: method for method in METHODS}, task)
     check_target(json, "--json", None)
     check_target(plot, "--plot", FIGURE_TYPES)
+    check_can_draw(plot, "--plot")
 
     measurements = []
     with progress_bar() as progress:

@@ -93,7 +93,9 @@ class VariedProblem:
     def __init__(self, problem: Problem, varied: list[Distribution]):
         self.problem, self.varied = problem, varied
         self.terms = dfx.ODETerm(lambda t, y, given: problem.terms.vf(t, y, given.args))
-        self.constraint = ConstraintInArgs(problem.constraint, problem.constraint.redundant)
+        self.constraint = ConstraintInArgs(
+            template=problem.constraint, redundant=problem.constraint.redundant
+        )
 
     def __repr__(self) -> str:
         """As the settings of the folder have it."""

@@ -12,6 +12,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
+import jax.core
 import numpy as np
 from jax.extend import core
 
@@ -188,7 +189,7 @@ def _long_scan(
     walk: Walk, equation: Any, constants: list[Value], carry: list[Value], xs: list[Value]
 ) -> list[Value]:
     """All iterations alike."""
-    items = [Value(x.depends.any(axis=0)) for x in xs]
+    items = [Value(x.depends.any(axis=0)) for x in xs]  # pyright: ignore[reportArgumentType]
     through = lambda carry: walk.through(equation.params["jaxpr"], constants + carry + items)
     m = len(carry)
     carry = _until_unchanged(lambda c: _either(c, through(c)[:m]), _forgotten(carry))

@@ -4,6 +4,7 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
+import jax.core
 import jax.flatten_util as jfu
 import jax.numpy as jnp
 import jax.tree_util as jtu
@@ -125,7 +126,7 @@ def _found(
     z = with_lifted(system, t, nearest.z, args)
     closing = without_derivative(system.closing(t, z, args))
     regular = closing.linearize(closing.z).full_rank
-    constraint = lambda z: ReducedConstraint(system)(closing.t, z, closing.args)
+    constraint = lambda z: ReducedConstraint(system=system)(closing.t, z, closing.args)
     r, G = jacobian(constraint, closing.z)
     level = jnp.max(jnp.abs(r) / row_scale(G, closing.z), initial=0)
     moving = G * jnp.asarray(np.where(fixed, 0, 1), G.dtype)[None, :]

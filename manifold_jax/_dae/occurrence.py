@@ -70,7 +70,7 @@ class Occurrence(NamedTuple):
             varies=slopes.depends[:, :-2].reshape(shape),
             depends_on_time=values.depends[:, -2],
             depends_on_args=values.depends[:, -1],
-            coefficients_vary=slopes.depends.any(axis=1),
+            coefficients_vary=slopes.depends.any(axis=1),  # pyright: ignore[reportArgumentType]
             unknown_primitives=values.unknown_primitives,
         )
 

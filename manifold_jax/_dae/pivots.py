@@ -38,8 +38,8 @@ class Elimination(NamedTuple):
         left = [_schur_complement(J, rows, columns, *others) for J in samples]
         for sign in (1, -1):
             if all(_is_definite(sign * S) for S in left):
-                return Elimination(rows, columns, *others, sign)
-        return Elimination(rows, columns, *others, 0)
+                return Elimination(rows, columns, *others, sign)  # pyright: ignore[reportCallIssue]
+        return Elimination(rows, columns, *others, 0)  # pyright: ignore[reportCallIssue]
 
     @property
     def is_definite(self) -> bool:
@@ -47,7 +47,7 @@ class Elimination(NamedTuple):
         return self.sign != 0 and len(self.other_rows) <= UNROLL_LIMIT
 
     def factorize(self, S: Float[Array, "k k"]) -> "Factorization | Pivoted":
-        return factorize(self.sign * S) if self.is_definite else Pivoted.of(S)
+        return factorize(self.sign * S) if self.is_definite else Pivoted.of(S)  # pyright: ignore[reportReturnType]
 
     def solve_rest(
         self, rest: "Factorization | Pivoted", b: Float[Array, " k"]

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from typing import Any
 
 import jax
+import jax.core
 import jax.flatten_util as jfu
 import jax.numpy as jnp
 import jax.tree_util as jtu
@@ -123,7 +124,7 @@ def _structure(equations: Equations, there: np.ndarray) -> Structure:
     structure = Structure.of(signature(there))
     if structure is not None:
         return structure
-    parts, names = SingularParts.of(there.any(axis=1)), equations.names
+    parts, names = SingularParts.of(there.any(axis=1)), equations.names  # pyright: ignore[reportArgumentType]
     named = lambda part: (
         listed([names.equations[i] for i in part[0]]),
         listed([names.unknowns[j] for j in part[1]]) or "none",

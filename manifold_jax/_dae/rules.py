@@ -67,7 +67,7 @@ def known_value(equation: Any, values: list[Value]) -> list[np.ndarray] | None:
 def union(values: list[Value]) -> np.ndarray:
     """All inputs that any of the numbers depends on."""
     flat = [value.depends.reshape(-1, value.depends.shape[-1]).any(axis=0) for value in values]
-    return functools.reduce(np.logical_or, flat)
+    return functools.reduce(np.logical_or, flat)  # pyright: ignore[reportReturnType]
 
 
 def _spread(depends: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
@@ -135,12 +135,12 @@ def _moved(equation: Any, values: list[Value]) -> list[Value] | None:
         start += size
     nowhere = np.arange(rows[0].shape[1]) == rows[0].shape[1] - 1  # some constant
     table = np.concatenate([*rows, nowhere[None]])
-    return [Value(table[places]) for places in move(equation, operands)]
+    return [Value(table[places]) for places in move(equation, operands)]  # pyright: ignore[reportArgumentType]
 
 
 def _reduced(equation: Any, values: list[Value]) -> list[Value]:
     axes = tuple(equation.params["axes"])
-    return [Value(value.depends.any(axis=axes)) for value in values]
+    return [Value(value.depends.any(axis=axes)) for value in values]  # pyright: ignore[reportArgumentType]
 
 
 def _cumulated(equation: Any, values: list[Value]) -> list[Value]:
@@ -169,7 +169,7 @@ def _contracted(equation: Any, values: list[Value]) -> list[Value]:
     for k, value in enumerate(values):
         there = values[1 - k].depends[..., -1].astype(np.float32)
         own = value.depends.astype(np.float32), [*letters[k], inputs]
-        depends |= np.einsum(*own, there, letters[1 - k], [*batch, *free, inputs]) > 0
+        depends |= np.einsum(*own, there, letters[1 - k], [*batch, *free, inputs]) > 0  # pyright: ignore[reportArgumentType, reportCallIssue]
     return [Value(np.asarray(depends))]
 
 

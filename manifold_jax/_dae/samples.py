@@ -34,7 +34,11 @@ class Samples(NamedTuple):
     def of(equations: Equations, layout: Layout, entries: Compressed, point: Point) -> "Samples":
         nothing = np.zeros(0, int)
         plan = Plan(
-            layout, entries, Elimination(*[nothing] * 4, 0), equations.order, layout.structure
+            layout,
+            entries,
+            Elimination(*[nothing] * 4, 0),  # pyright: ignore[reportCallIssue]
+            equations.order,
+            layout.structure,  # pyright: ignore[reportCallIssue]
         )
         static = Static(plan)
 

@@ -33,7 +33,7 @@ class ReducedDAE(eqx.Module):
         """The manifold, for [`Projected`][], [`Stabilized`][] and [`LocalCoordinates`][]: what the
         equations and their derivatives say of the state. Without equations (`num_constraints` of
         the report is 0) use the solver alone."""
-        return ReducedConstraint(self.system)
+        return ReducedConstraint(system=self.system)
 
     def consistent_state(
         self,

@@ -58,7 +58,7 @@ def checked_batch(
     full = (t0, t1, y0s, args)
     each, common = eqx.filter(full, mask), eqx.filter(full, mask, inverse=True)
     times = [t if np.ndim(t) == 0 else t[0] for t in (t0, t1)]
-    return Batch(each, common, time_dtype(*times, dt0, saveat), next(iter(sizes.values())))
+    return Batch(each, common, time_dtype(*times, dt0, saveat), next(iter(sizes.values())))  # pyright: ignore[reportArgumentType, reportCallIssue]
 
 
 def checked_step(dt0: Any, batch: Batch, axes: Axes) -> Any:

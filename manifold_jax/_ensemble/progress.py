@@ -2,26 +2,18 @@
 
 import time
 
-from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from .._terminal_bar import NoBar, print_line, terminal_bar
 
 
 class Meter:
     """Silent unless `shown`. Lines are at least a second apart, and a tenth of the time gone by."""
 
     def __init__(self, size: int, finished: int, failed: int, shown: bool):
-        self.console, self.size = Console(), size
+        self.size = size
         self.finished, self.begun_at, self.failed = finished, finished, failed
-        self.in_lines = shown and not self.console.is_interactive
-        self.bar = Progress(
-            TextColumn("{task.description}"),
-            BarColumn(),
-            TextColumn("{task.completed:.0f} of {task.total:.0f}{task.fields[rate]}"),
-            TimeElapsedColumn(),
-            TimeRemainingColumn(),
-            console=self.console,
-            disable=not shown or self.in_lines,
-        )
+        text = "{task.completed:.0f} of {task.total:.0f}{task.fields[rate]}"
+        self.bar = terminal_bar(shown, text, remaining=True)
+        self.in_lines = shown and isinstance(self.bar, NoBar)
         self.task = self.bar.add_task("ensemble", total=size, completed=finished, rate="")
         self.begun = self.last = time.perf_counter()
 
@@ -54,4 +46,4 @@ class Meter:
 
     def _line(self, text: str) -> None:
         if self.in_lines:
-            print(text, flush=True)
+            print_line(self.bar, text)

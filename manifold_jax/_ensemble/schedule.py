@@ -19,7 +19,7 @@ from .columns import (
     where,
     written,
 )
-from .trajectory import Outcome, Start
+from .trajectory import Start
 
 
 # Steps between two looks at which lanes have ended. A lane waits half of them on average.
@@ -52,8 +52,8 @@ class Run(NamedTuple):
     states there, as they were interpolated (a table, in its rows the times of one trajectory after
     those of the other), what was handed out, and whether some of it could not be corrected."""
 
-    start: Start
-    outcome: Outcome
+    start: Any  # `Start` and `Outcome`, or what the equations have in their place
+    outcome: Any
     rows: Array
     states: dict[str, Array]
     values: Any
@@ -127,7 +127,7 @@ class Schedule:
         index = jnp.minimum(jnp.arange(pieces * self.count), self.size - 1)
         starts, (correction,) = lax.map(begin, index.reshape(pieces, self.count))
         flat = lambda x: x.reshape(-1)[: self.size]
-        return [flat(x) for x in starts], flat(correction), layout
+        return [flat(x) for x in starts], flat(correction), layout  # pyright: ignore[reportReturnType]
 
     def _layouts(self, state_layout: Layout) -> tuple[Layout, Layout]:
         """Of outcomes and of states."""

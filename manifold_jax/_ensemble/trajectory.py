@@ -76,7 +76,7 @@ class Equations(eqx.Module):
     """What all trajectories have in common."""
 
     terms: dfx.AbstractTerm
-    solver: dfx.AbstractSolver  # for lanes one of this library
+    solver: Any  # for lanes one of this library, else any of Diffrax
     controller: dfx.AbstractStepSizeController
     saveat: dfx.SaveAt
     dt0: RealScalarLike | None
@@ -148,7 +148,7 @@ class Equations(eqx.Module):
         )
         kept = jnp.asarray(kept)
         tprev = jnp.minimum(tprev, t1)
-        tnext = _clipped(tprev, tnext, t1, kept)
+        tnext = _clipped(tprev, tnext, t1, kept)  # pyright: ignore[reportArgumentType]
         keep = lambda a, b: jnp.where(kept, a, b)
         result = update_result(RESULTS.where(kept, solver_result, RESULTS.successful), result)
         after = Trajectory(

@@ -82,7 +82,7 @@ class Simulator(eqx.Module):
         check_state(y0, "y0")
         y0 = jtu.tree_map(lambda leaf: jnp.asarray(leaf, float), y0)
         if isinstance(built, tuple):
-            return Setting(*built, y0, parameters)
+            return Setting(*built, y0, parameters)  # pyright: ignore[reportCallIssue]
         args = parameters if isinstance(built, MechanicalSystem) else built.args
         return Setting(built.terms, built.constraint, y0, args)
 
@@ -155,7 +155,7 @@ def _build(model: Any, parameters: Any) -> Any:
         )
     built = model(parameters)
     pair = isinstance(built, tuple) and len(built) == 2
-    if pair and isinstance(built[1], AbstractConstraint):
+    if pair and isinstance(built[1], AbstractConstraint):  # pyright: ignore[reportIndexIssue]
         return built
     if isinstance(built, MechanicalSystem) or hasattr(built, "with_args"):
         return built

@@ -86,7 +86,8 @@ def _flat_bounds(parameters: Any, bounds: Any) -> tuple[np.ndarray, np.ndarray]:
             "`bounds` must be a pair `(lower, upper)`, each a number or like `parameters` "
             "(with -inf and inf where there is none)."
         )
-    return tuple(_flat_prefix(b, parameters, "bounds", "a number") for b in bounds)
+    lower, upper = (_flat_prefix(b, parameters, "bounds", "a number") for b in bounds)
+    return lower, upper
 
 
 def _flat_prefix(prefix: Any, tree: Any, name: str, what: str) -> np.ndarray:

@@ -4,8 +4,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+from .._terminal_bar import NoBar, print_line, terminal_bar
 
 
 class Meter:
@@ -15,15 +14,8 @@ class Meter:
     """
 
     def __init__(self, shown: bool):
-        self.console, self.shown = Console(), shown
-        self.in_lines = shown and not self.console.is_interactive
-        columns = TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[loss]}")
-        self.bar = Progress(
-            *columns,
-            TimeElapsedColumn(),
-            console=self.console,
-            disable=not shown or self.in_lines,
-        )
+        self.shown, self.bar = shown, terminal_bar(shown, "{task.fields[loss]}")
+        self.in_lines = shown and isinstance(self.bar, NoBar)
         self.task = self.bar.add_task("fit", total=None, loss="")
         self.known: set[str] = set()
         self.name, self.listed, self.count, self.steps = "fit", False, 0, 0
@@ -73,4 +65,4 @@ class Meter:
 
     def _line(self, text: str, wanted: bool) -> None:
         if wanted:
-            self.console.print(text, soft_wrap=True, markup=False, highlight=False)
+            print_line(self.bar, text)

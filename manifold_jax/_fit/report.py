@@ -8,6 +8,8 @@ import jax.tree_util as jtu
 import numpy as np
 from scipy.special import chdtrc
 
+from .._extras import require
+
 
 # Truly wrong models are "rejected with vastly smaller values" (Press et al., Numerical Recipes, 15.1).
 _LEAST_PROBABILITY = 1e-3
@@ -82,7 +84,9 @@ class FitResult(eqx.Module):
 
     @property
     def reduced_chi_squared(self) -> float | None:
-        return None if self.chi_squared is None else self.chi_squared / self.degrees_of_freedom
+        if self.chi_squared is None or self.degrees_of_freedom is None:
+            return None
+        return self.chi_squared / self.degrees_of_freedom
 
     @property
     def probability(self) -> float | None:
@@ -91,8 +95,8 @@ class FitResult(eqx.Module):
 
     @property
     def fits(self) -> bool | None:
-        known = self.chi_squared is not None
-        return self.probability >= _LEAST_PROBABILITY if known else None
+        probability = self.probability
+        return None if probability is None else probability >= _LEAST_PROBABILITY
 
     def __str__(self) -> str:
         lines = self._verdict() + self._numbers()
@@ -153,6 +157,7 @@ class FitResult(eqx.Module):
 
         The Matplotlib figure.
         """
+        require("matplotlib", "cli", "`plot`")
         from matplotlib.figure import Figure  # a second that only pictures need
 
         figure = Figure(figsize=(12, 4), layout="constrained")
@@ -180,7 +185,7 @@ class FitResult(eqx.Module):
             (ts[r], a[r, :, k], b[r, :, k])
             for r in range(len(ts) if many else 1)
             for a, b in parts
-            for k in range(a.shape[2])
+            for k in range(a.shape[2])  # pyright: ignore[reportGeneralTypeIssues]
         ]
         return found[:8]
 

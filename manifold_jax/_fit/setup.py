@@ -3,6 +3,7 @@
 from typing import Any
 
 import jax
+import jax.core
 import jax.flatten_util as jfu
 import jax.numpy as jnp
 import jax.tree_util as jtu

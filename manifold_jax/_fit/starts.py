@@ -115,7 +115,7 @@ def optimize_all(
         if best is None or _better(found, best):
             best, chosen = found, rows[-1]
     others = sorted((row for row in rows if row is not chosen), key=lambda row: row.loss)
-    return best, (chosen, *others)
+    return best, (chosen, *others)  # pyright: ignore[reportReturnType]
 
 
 def _better(new: Outcome, old: Outcome) -> bool:

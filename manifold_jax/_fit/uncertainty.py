@@ -51,8 +51,8 @@ def _sparse(directions: np.ndarray) -> np.ndarray:
     count = directions.shape[0]
     if count == 0:
         return directions
-    R, order = scipy.linalg.qr(directions, mode="r", pivoting=True)
-    return np.linalg.solve(R[:, :count], R)[:, np.argsort(order)]
+    R, order = scipy.linalg.qr(directions, mode="r", pivoting=True)  # pyright: ignore[reportAssignmentType]
+    return np.linalg.solve(R[:, :count], R)[:, np.argsort(order)]  # pyright: ignore[reportArgumentType, reportCallIssue]
 
 
 def describe(

@@ -68,7 +68,9 @@ class LieGroupChart(mj.AbstractChart):
             y if group is None else jnp.zeros((group.dimension,), y.dtype)
             for group, y in self.parts(y)
         ]
-        return _LieCoordinates(self, constraint, projection, y, origin)
+        return _LieCoordinates(
+            chart=self, constraint=constraint, projection=projection, centre=y, origin=origin
+        )
 
     @property
     def state(self):

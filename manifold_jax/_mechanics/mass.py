@@ -55,7 +55,7 @@ class Mass(eqx.Module):
     def solve(self, rows: Float[Array, "*k n"]) -> Float[Array, "*k n"]:
         """`M^-1` applied to each row."""
         if self.factorization is None:
-            return rows / jnp.broadcast_to(self.diagonal, rows.shape)
+            return rows / jnp.broadcast_to(self.diagonal, rows.shape)  # pyright: ignore[reportArgumentType]
         return self.factorization.solve(rows.T).T
 
 
@@ -113,10 +113,10 @@ def _weights(M: Float[Array, "n n"], C: Float[Array, "m n"]) -> Float[Array, " m
 
 def _factorize_positive(M: Float[Array, "n n"]) -> Factorization:
     if M.shape[0] <= UNROLL_LIMIT:
-        return factorize(M)  # which wants positive pivots
+        return factorize(M)  # which wants positive pivots  # pyright: ignore[reportReturnType]
     threshold = 10 * M.shape[0] * float(jnp.finfo(M.dtype).eps)
     size = jnp.sqrt(jnp.maximum(jnp.abs(jnp.diagonal(M)), jnp.finfo(M.dtype).tiny))
     lower = jnp.linalg.cholesky(jax.lax.stop_gradient(M / size[:, None] / size[None, :]))
     positive = jnp.all(jnp.diagonal(lower) ** 2 > threshold)  # NaN unless positive definite
     factorization = factorize(jnp.where(positive, M, jnp.eye(M.shape[0], dtype=M.dtype)))
-    return Factorization(factorization.A, factorization.lu, positive)
+    return Factorization(factorization.A, factorization.lu, positive)  # pyright: ignore[reportAttributeAccessIssue]

@@ -139,10 +139,15 @@ class MechanicalSystem(eqx.Module):
     def constraint(self) -> MechanicalConstraint | ExtendedConstraint:
         """The manifold, for [`Projected`][], [`Stabilized`][] and [`LocalCoordinates`][]."""
         motion = MechanicalConstraint(
-            self.holonomic, self.nonholonomic, self.mass_matrix, self.redundant
+            holonomic=self.holonomic,
+            nonholonomic=self.nonholonomic,
+            mass_matrix=self.mass_matrix,
+            redundant=self.redundant,
         )
         return (
-            motion if self.further is None else ExtendedConstraint(motion, self.further_constraint)
+            motion
+            if self.further is None
+            else ExtendedConstraint(motion=motion, further=self.further_constraint)  # pyright: ignore[reportCallIssue]
         )
 
     @property

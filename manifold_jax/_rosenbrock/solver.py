@@ -79,7 +79,7 @@ class AbstractRosenbrock(dfx.AbstractAdaptiveSolver):
         derivative = system.refreshed(made_jump, solver_state.derivative, x0)
         step = rosenbrock_step(self.tableau, system, x0, derivative)
         finite = jnp.all(jnp.isfinite(step.x1)) & jnp.all(jnp.isfinite(step.error))
-        result = RESULTS.where(finite, RESULTS.successful, RESULTS.nonfinite)
+        result = RESULTS.where(finite, RESULTS.successful, RESULTS.nonfinite)  # pyright: ignore[reportArgumentType]
         singular = step.defined & ~step.regular | ~solver_state.usable
         result = RESULTS.where(singular, nonlinear_failure(), result)
         # No smaller step helps where the equations are not defined at its beginning.

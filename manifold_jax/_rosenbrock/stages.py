@@ -49,8 +49,8 @@ def rosenbrock_step(
         row = _without_zeros(tableau.a_lower[i - 1] if i > 0 else ())
         if (row, c) not in known:  # some methods have stages at the same point
             t, x = system.time(c), _plus(x0, row, U)
-            known[row, c] = system.increment(t, x), M0 if Z0 is None else system.mass_at(t, x)
-        f, M = known[row, c]
+            known[row, c] = system.increment(t, x), M0 if Z0 is None else system.mass_at(t, x)  # pyright: ignore[reportArgumentType]
+        f, M = known[row, c]  # pyright: ignore[reportArgumentType]
         coupling = _plus(None, tableau.c_lower[i - 1] if i > 0 else (), U)
         right = f if tableau.d[i] == 0 else f + tableau.d[i] * T
         if coupling is not None:
@@ -59,7 +59,7 @@ def rosenbrock_step(
             U.append(factor.solve(right))
             continue
         Z = _plus(Z0, row, V)
-        U.append(factor.solve(right - product(M - M0, Z)))
+        U.append(factor.solve(right - product(M - M0, Z)))  # pyright: ignore[reportOperatorIssue]
         V.append(U[i] / tableau.gamma - Z - (0 if coupling is None else coupling))
     finite = [jnp.all(jnp.isfinite(value)) for value in (f0, J, T)]
     # A finished lane of a batch makes steps of no length.

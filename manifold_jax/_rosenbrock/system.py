@@ -70,7 +70,7 @@ class System(NamedTuple):
             value = self.increment(t, x)
             if displacement is None:
                 return value, value
-            return value - product(self.mass_at(t, x), displacement), value
+            return value - product(self.mass_at(t, x), displacement), value  # pyright: ignore[reportArgumentType]
 
         t0 = jnp.asarray(self.t0)
         _, column, f0 = jax.linearize(lambda x: rest(t0, x), x0, has_aux=True)

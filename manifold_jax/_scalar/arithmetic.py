@@ -60,7 +60,7 @@ def _of_constants(primitive: Any, params: dict[str, Any], numbers: list[np.gener
         with np.errstate(all="ignore"):
             return numbers[0].dtype.type(plain(*numbers))
     with jax.ensure_compile_time_eval():
-        return np.asarray(primitive.bind(*map(jnp.asarray, numbers), **params))[()]
+        return np.asarray(primitive.bind(*map(jnp.asarray, numbers), **params))[()]  # pyright: ignore[reportReturnType]
 
 
 _PLAIN = {

@@ -52,7 +52,7 @@ def evaluate(lanes: Lanes, function: Any, values: list[Value]) -> list[Value]:
 
     def read(v: Any) -> Value:
         if isinstance(v, jax_core.Literal):
-            return Value.of_constant(np.asarray(v.val, v.aval.dtype))
+            return Value.of_constant(np.asarray(v.val, v.aval.dtype))  # pyright: ignore[reportAttributeAccessIssue]
         return known[v]
 
     for v, c in zip(jaxpr.constvars, constants, strict=True):
@@ -67,7 +67,7 @@ def evaluate(lanes: Lanes, function: Any, values: list[Value]) -> list[Value]:
 
 def _evaluated(lanes: Lanes, equation: Any, values: list[Value]) -> list[Value]:
     name = equation.primitive.name
-    if any(jax.dtypes.issubdtype(v.aval.dtype, jax.dtypes.extended) for v in equation.outvars):
+    if any(jax.dtypes.issubdtype(v.aval.dtype, jax.dtypes.extended) for v in equation.outvars):  # pyright: ignore[reportPrivateImportUsage]
         raise NotScalarError(f"`{name}` makes random keys")
     if name in _CALLS:
         return control.call(evaluate, lanes, equation, values)

@@ -73,7 +73,7 @@ class Lanes:
         """One for each lane."""
         x = self.emitted(x)
         if isinstance(x, np.generic):
-            return lax.full((self.count,), x, dtype)
+            return lax.full((self.count,), x, dtype)  # pyright: ignore[reportArgumentType]
         return x if x.ndim == 1 else lax.broadcast(x, (self.count,))
 
     def emitted(self, x: Number) -> Any:
@@ -96,8 +96,8 @@ class Lanes:
 
     def _emit(self, node: Node) -> None:
         operands = [y.array if isinstance(y, Node) else y for y in node.operands]
-        if any(not isinstance(y, np.generic) and y.ndim == 1 for y in operands):
-            arrays = [self.array(y, y.dtype) for y in operands]
+        if any(not isinstance(y, np.generic) and y.ndim == 1 for y in operands):  # pyright: ignore[reportOptionalMemberAccess]
+            arrays = [self.array(y, y.dtype) for y in operands]  # pyright: ignore[reportOptionalMemberAccess]
         else:
             arrays = [jnp.asarray(y) for y in operands]
         array = node.primitive.bind(*arrays, **node.params)

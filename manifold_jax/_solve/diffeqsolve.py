@@ -120,22 +120,24 @@ def diffeqsolve(
             **options,
         )
     bends_interpolant = event is not None  # every interpolated value is corrected otherwise
-    solver = trusting(solver.within(stepsize_controller, bends_interpolant), consistent)
+    hook: AbstractManifoldSolver = trusting(
+        solver.within(stepsize_controller, bends_interpolant), consistent
+    )
     ready = prepare(
-        terms, solver, t0, t1, dt0, y0, args, saveat, stepsize_controller, consistent, throw
+        terms, hook, t0, t1, dt0, y0, args, saveat, stepsize_controller, consistent, throw
     )
     sol = dfx.diffeqsolve(
         terms,
-        solver,
+        hook,
         ready.t0,
         ready.t1,
         ready.dt0,
         ready.y0,
         args,
-        saveat=on_manifold_saving(saveat, solver, event),
+        saveat=on_manifold_saving(saveat, hook, event),
         event=events_in_true_time(event, terms, ready.t0, ready.t1, ready.dt0),
         throw=False,
         solver_state=ready.solver_state if solver_state is None else solver_state,
         **options,
     )
-    return finish(sol, solver, saveat, event, ready.y0, args, ready.start, throw)
+    return finish(sol, hook, saveat, event, ready.y0, args, ready.start, throw)

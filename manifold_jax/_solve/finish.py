@@ -24,7 +24,7 @@ def finish(
 ) -> dfx.Solution:
     """Correct what was saved, and report; with `throw` raise what went wrong. `saveat` is what was
     asked for, and `sol.solver_state` has to be there."""
-    statistics = sol.solver_state.statistics
+    statistics = sol.solver_state.statistics  # pyright: ignore[reportOptionalMemberAccess]
     sol = _corrected(sol, solver, saveat, event, y0, args, start)
     if not throw:
         return sol
@@ -45,7 +45,7 @@ def _corrected(
     ys, failed = project_output(saveat, event, solver, sol.ts, sol.ys, y0, args)
     failed_output = RESULTS.where(failed, nonlinear_failure(), RESULTS.successful)
     # Diffrax forgets that a step failed if it has an event, too.
-    result = update_result(sol.result, sol.solver_state.result)
+    result = update_result(sol.result, sol.solver_state.result)  # pyright: ignore[reportOptionalMemberAccess]
     result = update_result(result, failed_output)
     if not solver.corrects_output:
         result = update_result(result, result_of_saved(saveat, sol.ts, ys))
@@ -53,9 +53,14 @@ def _corrected(
     interpolation = sol.interpolation
     if interpolation is not None and solver.corrects_output:
         interpolation = ManifoldInterpolation.build(
-            interpolation, solver.constraint, solver.projection, sol.t0, y0, args
+            interpolation,
+            solver.constraint,
+            solver.projection,
+            sol.t0,  # pyright: ignore[reportArgumentType]
+            y0,
+            args,  # pyright: ignore[reportArgumentType]
         )
-    statistics = sol.solver_state.statistics
+    statistics = sol.solver_state.statistics  # pyright: ignore[reportOptionalMemberAccess]
     stats = {
         **sol.stats,
         "initial_correction": start.correction,
@@ -68,7 +73,7 @@ def _corrected(
         t1=sol.t1,
         ts=sol.ts,
         ys=ys,
-        interpolation=interpolation,
+        interpolation=interpolation,  # pyright: ignore[reportArgumentType]
         stats=stats,
         result=result,
         solver_state=sol.solver_state if saveat.solver_state else None,

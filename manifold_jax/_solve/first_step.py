@@ -70,8 +70,8 @@ def first_step(
     f0, f1 = (jtu.tree_map(lambda v, i=i: v[i], velocities) for i in (0, 1))
     small, d1, h0 = trial(f0)
     rate = norm(jtu.tree_map(jnp.subtract, f1, f0)) / h0 / d1
-    power = 1 / (order + 1)
-    h1 = (0.01 / d1) ** power * rate ** (-order * power)
+    power = 1 / (order + 1)  # pyright: ignore[reportOptionalOperand]
+    h1 = (0.01 / d1) ** power * rate ** (-order * power)  # pyright: ignore[reportOptionalOperand]
     h = jnp.where(small, h0, jnp.minimum(100 * h0, h1))
     # A vector field that is not finite near the start says nothing about the step.
     h = jnp.where(jnp.isfinite(h) & (h > 0), h, 1e-3 * span)

@@ -56,7 +56,7 @@ def result_of_saved(saveat: dfx.SaveAt, ts: Any, ys: Any) -> RESULTS:
             finite &= jnp.all(row | ~jnp.isfinite(ts))
 
     jtu.tree_map(check, saveat.subs, ts, ys, is_leaf=lambda x: isinstance(x, dfx.SubSaveAt))
-    return RESULTS.where(finite, RESULTS.successful, RESULTS.nonfinite)
+    return RESULTS.where(finite, RESULTS.successful, RESULTS.nonfinite)  # pyright: ignore[reportArgumentType]
 
 
 def fault_messages(

@@ -53,7 +53,7 @@ def solve_without_hook(
         terms, solver, t0, t1, dt0, y0, args, saveat=watched, throw=throw, **options
     )
     result = update_result(sol.result, result_of_saved(watched, sol.ts, sol.ys))
-    ts, ys = (sol.ts[0], sol.ys[0]) if unseen else (sol.ts, sol.ys)
+    ts, ys = (sol.ts[0], sol.ys[0]) if unseen else (sol.ts, sol.ys)  # pyright: ignore[reportOptionalSubscript]
     sol = eqx.tree_at(
         lambda s: (s.ts, s.ys, s.result), sol, (ts, ys, result), is_leaf=lambda x: x is None
     )

@@ -88,7 +88,7 @@ def with_accurate_stages(solver: dfx.AbstractSolver) -> dfx.AbstractSolver:
     """The solver with its implicit stages solved to round-off, unless it has a root finder of the
     user's choice."""
     if isinstance(getattr(solver, "root_finder", None), dfx.VeryChord):
-        return eqx.tree_at(lambda s: s.root_finder, solver, replace_fn=StageChord)
+        return eqx.tree_at(lambda s: s.root_finder, solver, replace_fn=StageChord)  # pyright: ignore[reportArgumentType]
     return solver
 
 

@@ -88,7 +88,7 @@ class Problem(eqx.Module):
         self.name = name
         self.system = system
         self.chart = chart
-        self.terms = system.terms if terms is None else terms
+        self.terms = system.terms if terms is None else terms  # pyright: ignore[reportOptionalMemberAccess]
         self.t0 = t0
         self.t1 = t1
         self.args = jtu.tree_map(as_floating, args)

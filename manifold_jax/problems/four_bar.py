@@ -147,14 +147,14 @@ def four_bar(
 ) -> Problem:
     r"""A planar four-bar linkage of three moving bodies, a closed loop.
 
-    $q = (x_1, y_1, 	heta_1, \dots, x_3, y_3, 	heta_3)$: the centres and angles of crank,
-    coupler and rocker, uniform rods of length $l_i$ along $e_i = (\cos	heta_i, \sin	heta_i)$.
+    $q = (x_1, y_1, \theta_1, \dots, x_3, y_3, \theta_3)$: the centres and angles of crank,
+    coupler and rocker, uniform rods of length $l_i$ along $e_i = (\cos\theta_i, \sin\theta_i)$.
     With gravity and the masses $(m_i, m_i, m_i l_i^2 / 12)$, y upwards, four joints:
 
-    $$r_1 - 	frac{l_1}{2} e_1 = 0, \quad
-    r_1 + 	frac{l_1}{2} e_1 = r_2 - 	frac{l_2}{2} e_2, \quad
-    r_2 + 	frac{l_2}{2} e_2 = r_3 + 	frac{l_3}{2} e_3, \quad
-    r_3 - 	frac{l_3}{2} e_3 = (l_4, 0).$$
+    $$r_1 - \tfrac{l_1}{2} e_1 = 0, \quad
+    r_1 + \tfrac{l_1}{2} e_1 = r_2 - \tfrac{l_2}{2} e_2, \quad
+    r_2 + \tfrac{l_2}{2} e_2 = r_3 + \tfrac{l_3}{2} e_3, \quad
+    r_3 - \tfrac{l_3}{2} e_3 = (l_4, 0).$$
 
     The state is `(q, v)`, each of shape `(9,)`; 16 constraints, 8 positions and 8
     velocities, one degree of freedom. The standard linkage is a crank-rocker: the crank

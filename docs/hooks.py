@@ -1,0 +1,98 @@
+"""What this site does beyond its plugins: formulas as MathML, pages made of files elsewhere in the
+repository, and short names in cross references."""
+
+import re
+from html import unescape
+from pathlib import Path
+from typing import Any
+from xml.etree.ElementTree import Element, SubElement
+
+from latex2mathml.converter import convert
+from markdown import Extension, Markdown
+from markdown.blockprocessors import BlockProcessor
+from markdown.inlinepatterns import InlineProcessor
+from mkdocs.plugins import event_priority
+from mkdocs.structure.files import File, Files
+
+
+ROOT = Path(__file__).parents[1]
+PAGES = {"benchmarks.md": ROOT / "benchmarks" / "README.md", "changes.md": ROOT / "CHANGELOG.md"}
+# Folders that are copied, and which files of them.
+FOLDERS = {
+    "notebooks": (ROOT / "notebooks", ("*.ipynb",)),
+    "results": (ROOT / "benchmarks" / "results", ("**/*.png", "**/*.json", "**/*.gif")),
+}
+_LINK = re.compile(r"(?<!!)\[([^\]]+)\]\(([^)#]+)\)")
+_TEXT_CELL = re.compile(r'<div class="[^"]*jp-RenderedMarkdown.*?</div>', re.DOTALL)
+_FORMULA = re.compile(r"\$\$(.+?)\$\$|\$([^$]+)\$", re.DOTALL)
+_OBJECT = re.compile(r"^::: manifold_jax\.([\w.]+)$", re.MULTILINE)
+
+
+def on_config(config: Any) -> Any:
+    config.markdown_extensions.append(Formulas())
+    return config
+
+
+@event_priority(100)  # before the plugin that makes pages of notebooks
+def on_files(files: Files, config: Any) -> Files:
+    for name, (folder, patterns) in FOLDERS.items():
+        for path in sorted(path for pattern in patterns for path in folder.glob(pattern)):
+            uri = f"{name}/{path.relative_to(folder).as_posix()}"
+            files.append(File(uri, str(folder.parent), config.site_dir, config.use_directory_urls))
+    for uri, path in PAGES.items():
+        files.append(File.generated(config, uri, content=_linked(path.read_text(), files)))
+    return files
+
+
+def _linked(text: str, files: Files) -> str:
+    """Links to what is in the repository alone become text."""
+    is_here = lambda target: "://" in target or files.get_file_from_path(target) is not None
+    return _LINK.sub(lambda m: m[0] if is_here(m[2]) else m[1], text)
+
+
+def on_page_markdown(markdown: str, **_: Any) -> str:
+    """Docstrings refer to `[Projected][]` or `[mj.Projected][]`: anchors with these names."""
+    return _OBJECT.sub(r"[](){#\1}\n[](){#mj.\1}\n\n\g<0>", markdown)
+
+
+def on_page_content(html: str, page: Any, **_: Any) -> str:
+    """Of notebooks: formulas as on other pages, and without the scripts that would load MathJax and
+    Mermaid from elsewhere."""
+    if not page.file.src_uri.endswith(".ipynb"):
+        return html
+    html = re.sub(r"<script\b.*?</script>", "", html, flags=re.DOTALL)
+    return _TEXT_CELL.sub(lambda text: _FORMULA.sub(_formula, text[0]), html)
+
+
+def _formula(match: re.Match[str]) -> str:
+    display, inline = match.groups()
+    source = unescape(display or inline).replace("\n", " ")
+    return convert(source, display="block" if display else "inline")
+
+
+class Formulas(Extension):
+    """`$...$`, and `$$...$$` as a paragraph, as MathML, which browsers draw by themselves."""
+
+    def extendMarkdown(self, md: Markdown) -> None:
+        inline = r"(?<![\\$\w])\$([^$\s][^$]*?)\$(?![\d$])"
+        md.inlinePatterns.register(_Inline(inline, md), "formula", 185)
+        md.parser.blockprocessors.register(_Display(md.parser), "formula", 76)
+
+
+class _Inline(InlineProcessor):
+    def handleMatch(self, m: re.Match[str], data: str) -> tuple[str, int, int]:  # pyright: ignore
+        html = convert(m[1].replace("\n", " "))
+        return self.md.htmlStash.store(html), m.start(0), m.end(0)
+
+
+class _Display(BlockProcessor):
+    _whole = re.compile(r"\s*\$\$(.*)\$\$([.,;]?)\s*", re.DOTALL)
+
+    def test(self, parent: Element, block: str) -> bool:
+        return self._whole.fullmatch(block) is not None
+
+    def run(self, parent: Element, blocks: list[str]) -> None:
+        match = self._whole.fullmatch(blocks.pop(0))
+        assert match is not None
+        html = convert(match[1].replace("\n", " ") + match[2], display="block")
+        SubElement(parent, "p").text = self.parser.md.htmlStash.store(html)

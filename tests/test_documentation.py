@@ -1,0 +1,60 @@
+"""The site has a place for everything."""
+
+import re
+import subprocess
+import sys
+
+import pytest
+from documents import blocks_of, ROOT, run
+
+import manifold_jax as mj
+
+
+PAGES = ROOT / "docs" / "pages"
+
+
+def public_names():
+    for module, prefix in ((mj, ""), (mj.problems, "problems.")):
+        for name, x in vars(module).items():
+            if not name.startswith("_") and getattr(x, "__module__", "").startswith("manifold_jax"):
+                yield prefix + name
+
+
+@pytest.fixture(scope="module")
+def documented():
+    text = "\n".join(path.read_text() for path in (PAGES / "api").glob("*.md"))
+    return re.findall(r"^::: manifold_jax\.([\w.]+)$", text, flags=re.MULTILINE)
+
+
+def test_every_public_name_is_documented_once(documented):
+    assert sorted(documented) == sorted(public_names())
+
+
+def test_every_notebook_is_a_page():
+    navigation = (ROOT / "docs" / "mkdocs.yml").read_text()
+    for path in (ROOT / "notebooks").glob("*.ipynb"):
+        assert f"- notebooks/{path.name}\n" in navigation
+
+
+# The others compile for longer.
+QUICK = {"failing-trajectories", "extending"}
+# What is set before JAX and Equinox are imported.
+ALONE = {"export", "single-precision"}
+
+
+@pytest.mark.parametrize(
+    "page",
+    [
+        pytest.param(page, id=page.stem, marks=() if page.stem in QUICK else pytest.mark.slow)
+        for page in sorted(PAGES.rglob("*.md"))
+        if blocks_of(page)
+    ],
+)
+def test_examples_of_a_page_run_one_after_the_other(page, tmp_path, monkeypatch):
+    """They assert by themselves what the text says."""
+    monkeypatch.chdir(tmp_path)
+    if page.stem in ALONE:
+        script = "\n".join(blocks_of(page))
+        subprocess.run([sys.executable, "-W", "error", "-c", script], check=True)
+    else:
+        run(*blocks_of(page))
