@@ -93,7 +93,8 @@ class Tangents:
     ) -> tuple[Any, Any]:
         equations = in_steps(self.parts.rest[0])
         interpolated = lambda info: equations.interpolated(t, start, end, info)
-        return jax.jvp(interpolated, *((info,) for info in dense_info))
+        info, tangent = dense_info
+        return jax.jvp(interpolated, (info,), (tangent,))
 
     def handed_out(self, given: Given, t: FloatScalar, y: Any) -> tuple[Any, BoolScalar]:
         def value(equations, given, y):

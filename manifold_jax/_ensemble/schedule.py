@@ -92,7 +92,7 @@ class Schedule:
         def advance(carry: tuple[Lane, Totals]) -> tuple[Lane, Totals]:
             with self.lanes.inside():
                 lane, totals = carry
-                step = lambda carry, _: (self._step(*carry, state_layout), None)
+                step = lambda carry, _: (self._step(carry[0], carry[1], state_layout), None)
                 (lane, states), _ = lax.scan(step, (lane, totals.states), None, length=_STEPS)
                 return self._refill(lane, totals._replace(states=states), starts, state_layout)
 
@@ -136,17 +136,21 @@ class Schedule:
         outcomes = Layout.of(jax.eval_shape(outcome, given, trajectory))
         return outcomes, Layout.of(self.equations.state_of(trajectory))
 
+    def _layout_of_values(self, y_layout: Layout) -> Layout:
+        value = lambda given, t, y: self.equations.handed_out(self.complete(given), t, y)[0]
+        given, y = self.given_layout.example(), y_layout.example()
+        return Layout.of(jax.eval_shape(value, given, self.ts[0], y))
+
     def _handed_out(
         self, totals: Totals, firsts: list[Array], y_layout: Layout
     ) -> tuple[Any, Array]:
         """What is saved of the states, time by time; lanes go together."""
-        layout, times = None, self.ts.size
+        times, layout = self.ts.size, self._layout_of_values(y_layout)
 
         def of_lanes(index: Array) -> tuple[Array, list[Array]]:
             given, first, rows = taken(self.given, index), taken(firsts, index), totals.rows[index]
 
             def at_time(failed: Array, row: Array) -> tuple[Array, list[Array]]:
-                nonlocal layout
                 reached = row < rows
                 with self.lanes.inside(first[0]):
                     y = read(totals.states, index * times + row, y_layout.dtypes_of_columns())
@@ -155,7 +159,6 @@ class Schedule:
                         [jnp.broadcast_to(self.ts[row], reached.shape)]
                     )
                     value, success = self._call(self.equations.handed_out, given, t, y)
-                    layout = Layout.of(value)
                     failed |= reached & ~_column(success, self.lanes)
                     return failed, columns_of_values(value, self.lanes)
 
