@@ -3,7 +3,7 @@ to SciPy; double pendulums next to C; and a batch in which a few trajectories ta
 
 `python -m benchmarks.ensemble --json benchmarks/results/ensemble.json`
 
-Projected Tsit5, rtol = atol = 1e-6, the states at the end, from disturbed initial values that are made
+Projected Tsit5, rtol = atol = 1e-6, the states at the end (and once 101 of them), from disturbed initial values that are made
 consistent; microseconds per step and trajectory on one core. `vmap` gets fewer trajectories, as its time
 grows with them; SciPy (DOP853, no constraint) gets three. `double_pendulum.c` takes the same steps, with gcc
 where there is one.
@@ -45,12 +45,14 @@ from ._measure import (
 TOLERANCE = 1e-6
 CONTROLLER = dfx.PIDController(rtol=TOLERANCE, atol=TOLERANCE)
 DISTURBANCE = 0.1
+SAVED = 101
 PROBLEMS = ("pendulum", "double_pendulum", "rigid_body", "kepler", "slider_crank", "four_bar")
 
 
 @dataclasses.dataclass(frozen=True)
 class Row:
     problem: str
+    saved: int  # values of each trajectory
     method: str
     trajectories: int
     steps: float  # of a trajectory
@@ -77,21 +79,23 @@ def starts(problem: Problem, size: int) -> Any:
     return jtu.tree_map(lambda x: x[chosen], y0s)
 
 
-def methods(problem: Problem, lanes: int) -> dict[str, Callable]:
-    hook, args = (
-        mj.Projected(dfx.Tsit5(), problem.constraint),
-        jtu.tree_map(jnp.asarray, problem.args),
-    )
+def times_of(problem: Problem, saved: int) -> Any:
+    return np.linspace(problem.t0, problem.t1, saved) if saved > 1 else np.array([problem.t1])
+
+
+def methods(problem: Problem, saved: int, lanes: int) -> dict[str, Callable]:
+    hook = mj.Projected(dfx.Tsit5(), problem.constraint)
+    args = jtu.tree_map(jnp.asarray, problem.args)
     common = problem.terms, hook, problem.t0, problem.t1, None
+    saveat = dfx.SaveAt(ts=times_of(problem, saved)) if saved > 1 else dfx.SaveAt(t1=True)
+    options = {"saveat": saveat, "stepsize_controller": CONTROLLER}
 
     def one(y0: Any) -> Outcome:
-        sol = mj.diffeqsolve(*common, y0, args, stepsize_controller=CONTROLLER, throw=False)
+        sol = mj.diffeqsolve(*common, y0, args, throw=False, **options)
         return Outcome(sol.ys, sol.stats["num_steps"])
 
     def ensemble(y0s: Any) -> Outcome:
-        sol = mj.solve_ensemble(
-            *common, y0s, args, in_axes=None, stepsize_controller=CONTROLLER, lanes=lanes
-        )
+        sol = mj.solve_ensemble(*common, y0s, args, in_axes=None, lanes=lanes, **options)
         return Outcome(sol.ys, sol.stats["num_steps"])
 
     return {
@@ -102,7 +106,7 @@ def methods(problem: Problem, lanes: int) -> dict[str, Callable]:
     }
 
 
-def scipy_row(problem: Problem, y0s: Any) -> Row:
+def scipy_row(problem: Problem, saved: int, y0s: Any) -> Row:
     """Of the first three, with the vector field compiled by JAX."""
     args = jtu.tree_map(jnp.asarray, problem.args)
     _, unravel = jfu.ravel_pytree(problem.y0)
@@ -110,19 +114,22 @@ def scipy_row(problem: Problem, y0s: Any) -> Row:
     flat = [
         np.asarray(jfu.ravel_pytree(jtu.tree_map(lambda x, i=i: x[i], y0s))[0]) for i in range(3)
     ]
-    span = problem.t0, problem.t1
-    solve = lambda y: solve_ivp(
-        lambda t, y: np.asarray(field(t, y)), span, y, "DOP853", rtol=TOLERANCE, atol=TOLERANCE
+    right_hand_side = lambda t, y: np.asarray(field(t, y))
+    span, ts = (problem.t0, problem.t1), times_of(problem, saved)
+    solve = lambda y, ts=ts: solve_ivp(
+        right_hand_side, span, y, "DOP853", ts, rtol=TOLERANCE, atol=TOLERANCE
     )
     solve(flat[0])
     start = time.perf_counter()
     sols = [solve(y) for y in flat]
     seconds = (time.perf_counter() - start) / len(sols)
-    steps = float(np.mean([sol.t.size - 1 for sol in sols]))
+    steps = float(np.mean([solve(y, None).t.size - 1 for y in flat]))
     ends = jax.vmap(unravel)(jnp.asarray(np.stack([sol.y[:, -1] for sol in sols])))
     violation = largest_violation(problem, ends)
     us = 1e6 * seconds
-    return Row(problem.name, "SciPy DOP853", 3, steps, violation, np.nan, None, us, us / steps)
+    return Row(
+        problem.name, saved, "SciPy DOP853", 3, steps, violation, np.nan, None, us, us / steps
+    )
 
 
 def largest_violation(problem: Problem, ends: Any) -> float:
@@ -131,23 +138,24 @@ def largest_violation(problem: Problem, ends: Any) -> float:
     return float(jnp.max(jax.vmap(one)(ends)))
 
 
-def measure(problem: Problem, size: int, lanes: int, repeats: int) -> list[Row]:
+def measure(problem: Problem, saved: int, size: int, lanes: int, repeats: int) -> list[Row]:
     y0s = starts(problem, size)
     few = jtu.tree_map(lambda x: x[: min(size, 1000)], y0s)
     programs: dict[str, tuple[Callable, CompileTime]] = {}
-    for name, function in methods(problem, lanes).items():
+    for name, function in methods(problem, saved, lanes).items():
         programs[name] = compiled(function, y0s if name == "solve_ensemble" else few)
     timings = interleaved({name: run for name, (run, _) in programs.items()}, repeats)
     reference = programs["one by one"][0]()
     rows = [
-        row_of(problem, name, run(), reference, seconds, timings[name])
+        row_of(problem, saved, name, run(), reference, seconds, timings[name])
         for name, (run, seconds) in programs.items()
     ]
-    return [*rows, scipy_row(problem, y0s)]
+    return [*rows, scipy_row(problem, saved, y0s)]
 
 
 def row_of(
     problem: Problem,
+    saved: int,
     name: str,
     outcome: Outcome,
     reference: Outcome,
@@ -163,6 +171,7 @@ def row_of(
     us = 1e3 * timing.median_ms
     return Row(
         problem.name,
+        saved,
         name,
         size,
         float(jnp.mean(outcome.num_steps)),
@@ -177,6 +186,7 @@ def row_of(
 def table_of(rows: list[Row]) -> Table:
     table = Table(title="One core", title_justify="left")
     table.add_column("problem", no_wrap=True)
+    table.add_column("saved", justify="right")
     table.add_column("method", no_wrap=True)
     headings = ("trajectories", "steps", "max |g|", "difference", "compile, s", "us / trajectory")
     for heading in (*headings, "us / step", "times ours"):
@@ -188,6 +198,7 @@ def table_of(rows: list[Row]) -> Table:
             ours = r.us_per_trajectory
         table.add_row(
             r.problem,
+            str(r.saved),
             r.method,
             str(r.trajectories),
             f"{r.steps:.0f}",
@@ -207,6 +218,7 @@ def main(
     lanes: Annotated[int, typer.Option(min=1, help="That advance together.")] = 128,
     repeats: Annotated[int, typer.Option(min=1, help="Timed runs of each program.")] = 3,
     problems: Annotated[str, typer.Option(metavar="NAME,...")] = ",".join(PROBLEMS),
+    saved: Annotated[int, typer.Option(min=2, help="Values of double pendulums, once.")] = SAVED,
     pendulums: Annotated[int, typer.Option(min=1, help="Next to C.")] = 20_000,
 ) -> None:
     """Measure ensembles next to `vmap`, `lax.map`, SciPy and C."""
@@ -216,7 +228,8 @@ def main(
     with console.status("measuring"):
         rows = []
         for name in problems.split(","):
-            rows += measure(getattr(mj.problems, name)(), size, lanes, repeats)
+            rows += measure(getattr(mj.problems, name)(), 1, size, lanes, repeats)
+        rows += measure(mj.problems.double_pendulum(), saved, size, lanes, repeats)
         pendulum_rows = by_hand.measure(pendulums, lanes, TOLERANCE, repeats)
         tail = heavy_tail.measure(size, lanes, TOLERANCE, repeats)
     console.print(table_of(rows), by_hand.table_of(pendulum_rows))

@@ -20,16 +20,16 @@ PEERS = ("casadi", "mujoco", "pydiffsol", "sksundae")
 # Without those that compile or train for a minute and more (`gradients`, `neural`, `overhead`, `thresholds`) and
 # `fuzz`, which has tests of its own.
 SMALLEST = {
-    "accelerator": dict(sizes="4", lanes=2, repeats=1, problems="lorenz"),
+    "accelerator": dict(sizes="4", lanes=2, repeats=1, problems="lorenz", precisions="double"),
     "approaches": dict(problems="pendulum", repeats=1, quick=True),
     "closed_forms": dict(repeats=1),
     "compile_time": dict(compilations=1, repeats=1, only="pendulum"),
     "devices": dict(size=4, repeats=1),
-    "ensemble": dict(size=4, lanes=2, repeats=1, problems="pendulum", pendulums=4),
+    "ensemble": dict(size=4, lanes=2, repeats=1, problems="pendulum", saved=2, pendulums=4),
     "mujoco_peers": dict(),
     "pendulum_peers": dict(repeats=1),
 }
-QUICK = ("ensemble",)
+QUICK = ("accelerator",)
 
 
 @contextlib.contextmanager
