@@ -85,6 +85,7 @@ GRID = np.stack([TS, TS + 0.5, 0.8 * TS])
 MANY = np.stack([positions(t - t[0], angle=a) for t, a in zip(GRID, ANGLES)])
 
 
+@pytest.mark.slow
 def test_many_trajectories_with_unknown_initial_states():
     guess = positions(np.zeros(3), radius=2.4, angle=ANGLES[:, None] + 0.3)[:, 0]
     result = fit_circle(MANY, ts=GRID, y0=guess, fit_initial=True)
@@ -110,6 +111,7 @@ def _body(middle):
     return mj.problems.rigid_body(inertia=jnp.stack([2.0 + 0 * middle, middle, 2 / 3 + 0 * middle]))
 
 
+@pytest.mark.slow
 def test_optax_with_mini_batches_and_early_stop():
     y0 = positions(np.zeros(1), angle=ANGLES[:, None])[:, 0]
     options = dict(y0=y0, ts=GRID, optimizer=optax.adam(1e-2), sigma=1.0, batch_size=2)
@@ -164,6 +166,7 @@ def test_own_loss_is_robust():
 LONG = np.linspace(0, 40, 201)
 
 
+@pytest.mark.slow
 def test_multiple_shooting_finds_what_single_shooting_misses():
     """Thirty turns: with a wrong rate the phases have nothing to do with each other."""
     data = noisy(positions(LONG, 5.0), 0.02)
@@ -212,6 +215,7 @@ def test_failing_trajectories_have_no_influence_and_are_reported():
     assert_close(result.standard_errors, alone.standard_errors, 1e-4)
 
 
+@pytest.mark.slow
 def test_steps_into_parameters_that_cannot_be_solved_are_rejected():
     """On a logarithmic scale the first full step overshoots, to where there is no field."""
     tried = []

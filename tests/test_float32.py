@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import outside
 import pytest
+from variants import variants
 
 import manifold_jax as mj
 
@@ -33,19 +34,8 @@ def build(name):
     )
 
 
-# Long to compile.
-MECHANISMS = {
-    *("four-bar", "heavy-top", "parallelogram", "double-pendulum", "chain", "slider-crank"),
-    *("rolling-disc", "spherical-pendulum", "rotation"),
-}
-
-
 @pytest.mark.parametrize(
-    "name",
-    [
-        pytest.param(name, marks=pytest.mark.slow) if name in MECHANISMS else name
-        for name in [*mj.problems.ALL, "outside"]
-    ],
+    "name", variants([*mj.problems.ALL, "outside"], ["pendulum", "kepler", "skate", "outside"])
 )
 def test_gallery_in_single_precision(name):
     terms, constraint, (t0, t1, y0, args) = build(name)

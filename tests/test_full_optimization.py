@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from optimized import optimized_jit
+from variants import variants
 
 import manifold_jax as mj
 
@@ -23,12 +24,9 @@ HOOKS = {
     ),
 }
 ON_THE_MANIFOLD = ("projected", "tangent", "partition")
-SLOW = ("exact", "partition")
 
 
-@pytest.mark.parametrize(
-    "hook", [pytest.param(h, marks=pytest.mark.slow) if h in SLOW else h for h in HOOKS]
-)
+@pytest.mark.parametrize("hook", variants(HOOKS, ["projected"]))
 def test_every_approach_and_its_gradient_in_a_batch(hook):
     """The gradient is that of differences between lanes; equal lanes are equal to the last bit."""
     problem = mj.problems.pendulum()

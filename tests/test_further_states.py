@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.integrate
+from variants import variants
 
 import manifold_jax as mj
 
@@ -79,7 +80,7 @@ HOOKS = {
 }
 
 
-@pytest.mark.parametrize("name", HOOKS)
+@pytest.mark.parametrize("name", variants(HOOKS, ["projected"]))
 def test_controlled_rod(name):
     """Agrees with the equations in angles; `q`, `v` and the part of `z` with a constraint are on
     the manifold, the rest of `z` is not moved."""
@@ -117,6 +118,7 @@ def test_of_a_lagrangian_and_without_a_constraint_on_further_states():
     np.testing.assert_allclose(sol.ys[2]["work"], expected[3], atol=2e-8)
 
 
+@pytest.mark.slow
 def test_gradient_with_respect_to_a_gain():
     """Of the work, forward = reverse = differences."""
     built = system()

@@ -144,13 +144,14 @@ COUNTS = {
     ("Dopri8", swinging): [24, 32, 40, 48, 56, 64, 80],
     ("Dopri8", two_rods): [32, 40, 48, 56, 64],
 }
-# One solver for every approach by default, the rest in the slow part.
+# One solver for each approach by default, the rest in the slow part.
+DEFAULT = [("Dopri5", two_rods, hook) for hook in ("projected", "invariant", "tangent")]
 CASES = [
     pytest.param(
         name,
         make,
         hook,
-        marks=() if (name, make) == ("Dopri5", two_rods) else pytest.mark.slow,
+        marks=() if (name, make, hook) in DEFAULT else pytest.mark.slow,
         id=f"{name}-{make.__name__}-{hook}",
     )
     for name, make in COUNTS

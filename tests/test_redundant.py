@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from variants import variants
 
 import manifold_jax as mj
 
@@ -40,7 +41,7 @@ def orbit(e, tolerance=1e-8, t1=2.0, **options):
     return sol, mj.constraint_violation(constraint, sol.ts, sol.ys)
 
 
-@pytest.mark.parametrize("tolerance", [1e-4, 1e-8, 1e-11])
+@pytest.mark.parametrize("tolerance", variants([1e-4, 1e-8, 1e-11], [1e-8]))
 def test_all_invariants_of_a_planet(tolerance):
     """To round-off, on nearly circular and on very long orbits; exact by Kepler's equation."""
     t1 = 12.0

@@ -55,6 +55,7 @@ CAR_AXIS = {
 }  # fmt: skip
 
 
+@pytest.mark.slow
 def test_car_axis_with_multipliers():
     problem = mj.problems.car_axis()
     sol = solve(problem, 1e-13)
@@ -72,6 +73,7 @@ SLIDER_CRANK = {
 }
 
 
+@pytest.mark.slow
 def test_slider_crank():
     problem = mj.problems.slider_crank()
     sol = solve(problem, 1e-12)

@@ -211,6 +211,7 @@ def test_published_solutions(problem, name, least, most_steps):
     assert sol.stats["num_steps"] < most_steps
 
 
+@pytest.mark.slow
 def test_transistor_amplifier():
     """A singular mass matrix that is not diagonal. 6.8 digits with rtol = atol = 1e-5."""
     found, sol = digits(PROBLEMS["transistor amplifier"], "Rodas5P", 1e3)
@@ -307,6 +308,7 @@ def test_gradients_of_diffrax_agree(adjoint):
     np.testing.assert_allclose(gradient(adjoint), gradient(mj.StepReplayAdjoint()), rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_gradient_of_a_stiff_adaptive_solve():
     """Of Robertson's y1(1e3) by the logarithms of the rates: their sum is t dy1/dt, as only rates
     have a unit of time."""

@@ -24,6 +24,7 @@ def start(arguments, flags=""):
     )
 
 
+@pytest.mark.slow
 def test_two_devices():
     file = HERE / "several_devices.py"
     process = start(

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 import pytest
+from variants import variants
 
 import manifold_jax as mj
 
@@ -45,6 +46,10 @@ STRATONOVICH = [
     dfx.HalfSolver(dfx.Heun()),
 ]
 name = lambda solver: type(solver).__name__
+ONE_OF_A_KIND = (
+    "Tsit5 Dopri8 ImplicitEuler Kvaerno3 KenCarp3 Heun EulerHeun StratonovichMilstein SlowRK"
+)
+one_of_a_kind = lambda solver: name(solver) in ONE_OF_A_KIND.split()
 
 
 def field(t, y, args):
@@ -63,7 +68,7 @@ def reference(t):
     return solve_ivp(f, (0, t), np.asarray(START), rtol=1e-12, atol=1e-12, method="DOP853").y[:, -1]
 
 
-@pytest.mark.parametrize("solver", EXPLICIT + IMPLICIT, ids=name)
+@pytest.mark.parametrize("solver", variants(EXPLICIT + IMPLICIT, one_of_a_kind), ids=name)
 def test_constant_steps(solver):
     sol = mj.diffeqsolve(
         dfx.ODETerm(field),
@@ -102,7 +107,7 @@ def test_adaptive_steps(solver):
     np.testing.assert_allclose(sol.ys[-1], reference(1.0), atol=2e-5)
 
 
-@pytest.mark.parametrize("solver", IMEX, ids=name)
+@pytest.mark.parametrize("solver", variants(IMEX, one_of_a_kind), ids=name)
 def test_implicit_explicit(solver):
     half = dfx.ODETerm(lambda t, y, args: 0.5 * field(t, y, args))
     sol = mj.diffeqsolve(
@@ -141,7 +146,7 @@ def tangent_noise(key, span=(0.0, 1.0)):
     return dfx.MultiTerm(drift, diffusion)
 
 
-@pytest.mark.parametrize("solver", STRATONOVICH, ids=name)
+@pytest.mark.parametrize("solver", variants(STRATONOVICH, one_of_a_kind), ids=name)
 def test_stratonovich(solver):
     sol = mj.diffeqsolve(
         tangent_noise(jax.random.key(0)),
@@ -155,6 +160,7 @@ def test_stratonovich(solver):
     assert off_sphere(sol.ys) <= 2e-15
 
 
+@pytest.mark.slow
 def test_brownian_motion_on_the_sphere_has_the_right_law():
     """E[y(t)] = exp(-t) y(0) on S^2: half the Laplacian has eigenvalue -1."""
 

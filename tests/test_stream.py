@@ -178,6 +178,7 @@ def test_other_settings_are_refused(message, whole):
     assert contents(whole) == before
 
 
+@pytest.mark.slow
 def test_arrays_in_functions_are_settings(tmp_path):
     """Also those that are inputs of the compiled program, not part of it."""
 
@@ -329,6 +330,7 @@ def test_command(tmp_path):
     assert "y0.0.1=normal(0.0, 0.5)" in unframed(other.output)
 
 
+@pytest.mark.slow
 def test_command_reports_failures(tmp_path):
     """Of starts so far away that their squares are infinite."""
     arguments = [*PENDULUM, "--vary", "args.gravity=uniform(9,10)", "--vary"]
