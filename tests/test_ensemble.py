@@ -241,6 +241,143 @@ def test_gradients(name, saveat, segments, monkeypatch):
         assert np.abs(a).max() > 1e-3
 
 
+@pytest.mark.slow
+@pytest.mark.slow
+@pytest.mark.slow
+@pytest.mark.slow
+@pytest.mark.slow
+@pytest.mark.slow
+@pytest.mark.slow
+@pytest.mark.slow
+@pytest.mark.slow
+@pytest.mark.slow
+@pytest.mark.slow
+@pytest.mark.slow
+@pytest.mark.slow
+@pytest.mark.slow
+@pytest.mark.slow
+@pytest.mark.slow
+@pytest.mark.slow
+@pytest.mark.slow
+@pytest.mark.slow
+@pytest.mark.slow
+@pytest.mark.slow
+@pytest.mark.slow
+@pytest.mark.slow
+@pytest.mark.slow
+@pytest.mark.slow
+@pytest.mark.slow
+@pytest.mark.slow
+@pytest.mark.slow
+@pytest.mark.slow
+@pytest.mark.slow
+@pytest.mark.slow
+@pytest.mark.slow
+@pytest.mark.slow
+@pytest.mark.slow
+@pytest.mark.slow
+@pytest.mark.slow
+@pytest.mark.slow
+@pytest.mark.slow
+@pytest.mark.slow
+@pytest.mark.slow
+@pytest.mark.slow
+@pytest.mark.slow
+@pytest.mark.slow
+@pytest.mark.slow
+@pytest.mark.slow
+@pytest.mark.slow
+@pytest.mark.slow
+@pytest.mark.slow
+@pytest.mark.slow
+@pytest.mark.slow
+@pytest.mark.slow
+@pytest.mark.slow
+@pytest.mark.slow
+@pytest.mark.slow
+@pytest.mark.slow
+@pytest.mark.slow
+@pytest.mark.slow
+@pytest.mark.slow
+@pytest.mark.slow
+@pytest.mark.slow
+@pytest.mark.slow
+@pytest.mark.slow
+@pytest.mark.slow
+@pytest.mark.slow
+@pytest.mark.slow
+@pytest.mark.slow
+@pytest.mark.slow
+@pytest.mark.slow
+@pytest.mark.slow
+@pytest.mark.slow
+@pytest.mark.slow
+@pytest.mark.slow
+@pytest.mark.slow
+@pytest.mark.slow
+@pytest.mark.slow
+@pytest.mark.slow
+@pytest.mark.slow
+@pytest.mark.slow
+@pytest.mark.slow
+@pytest.mark.slow
+@pytest.mark.slow
+@pytest.mark.slow
+@pytest.mark.slow
+@pytest.mark.slow
+@pytest.mark.slow
+@pytest.mark.slow
+@pytest.mark.slow
+@pytest.mark.slow
+@pytest.mark.slow
+@pytest.mark.slow
+@pytest.mark.slow
+@pytest.mark.slow
+@pytest.mark.slow
+@pytest.mark.slow
+@pytest.mark.slow
+@pytest.mark.slow
+@pytest.mark.slow
+@pytest.mark.slow
+@pytest.mark.slow
+@pytest.mark.slow
+@pytest.mark.slow
+@pytest.mark.slow
+@pytest.mark.slow
+@pytest.mark.slow
+@pytest.mark.slow
+@pytest.mark.slow
+@pytest.mark.slow
+@pytest.mark.slow
+@pytest.mark.slow
+@pytest.mark.slow
+@pytest.mark.usefixtures("only_in_lanes")
+def test_gradient_beside_values_that_have_none():
+    """Functions that also return whole numbers and truth values, at given times and at the end."""
+    fn = lambda t, y, args: {"is up": y[1] > 0, "turns": jnp.floor(t).astype(int), "x": args * y[0]}
+    saveat = dfx.SaveAt(ts=jnp.array([0.2]), t1=True, fn=fn)
+    solve = lambda rates, adjoint: mj.solve_ensemble(
+        TURN,
+        HOOKS["projected"],
+        0.0,
+        0.5,
+        0.125,
+        STARTS,
+        rates,
+        lanes=LANES,
+        adjoint=adjoint,
+        saveat=saveat,
+    )
+    loss = lambda rates, adjoint: jnp.sum(jnp.sin(solve(rates, adjoint).ys["x"]))
+    reverse = jax.grad(loss)(RATES, mj.StepReplayAdjoint())
+    along = jnp.cos(RATES)
+    _, slope = jax.jvp(lambda r: loss(r, dfx.ForwardMode()), (RATES,), (along,))
+    np.testing.assert_allclose(slope, along @ reverse, rtol=0, atol=1e-12)
+    h = 1e-6 * along
+    both = loss(RATES + h, dfx.ForwardMode()) - loss(RATES - h, dfx.ForwardMode())
+    np.testing.assert_allclose(slope, both / 2e-6, rtol=0, atol=1e-8)
+
+
 @pytest.mark.usefixtures("only_in_lanes")
 def test_gradient_beside_a_failure():
     """A trajectory that nothing depends on adds nothing, also if its steps have no derivative."""

@@ -121,15 +121,17 @@ def tangents_in_lanes(inputs: Inputs, tangents: Any, lanes: int, limit: int) -> 
     values, values_tangent = run.values or (None, None)
     reached = jnp.arange(run.rows.size) if values is None else _reached(run, values)
     values_tangent = jtu.tree_map(lambda x: jnp.where(_like(reached, x), x, 0), values_tangent)
+    smooth_values, others = eqx.partition(values, eqx.is_inexact_array)
     start, outcome = run.start.trajectory, run.outcome.outcome
 
-    def saved(each: Any, common: Any, first: Any, last: Any, values: Any) -> Any:
+    def saved(each: Any, common: Any, first: Any, last: Any, smooth_values: Any) -> Any:
         equations, batch = parts.inputs(each, common)
+        values = eqx.combine(smooth_values, others)
         begun = Start(start.trajectory._replace(y=first), run.start.correction)
         new = run._replace(start=begun, outcome=outcome._replace(y=last), values=values)
         return eqx.filter(saved_rows(equations.saveat.subs, batch, new), eqx.is_inexact_array)
 
-    at = parts.each, parts.common, start.trajectory.y, outcome.y, values
+    at = parts.each, parts.common, start.trajectory.y, outcome.y, smooth_values
     along = along.each, along.common, start.tangent[0], run.outcome.tangent, values_tangent
     return jax.jvp(saved, at, along)[1]
 

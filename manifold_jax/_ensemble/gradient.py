@@ -26,14 +26,17 @@ def gradient_in_lanes(
     if parts.num_common() > _MOST_IN_COMMON:
         raise NotScalarError("too many numbers in common")
 
-    def saved(each: Any, common: Any, first: Any, last: Any, values: Any) -> Any:
+    smooth_values, others = eqx.partition(run.values, eqx.is_inexact_array)
+
+    def saved(each: Any, common: Any, first: Any, last: Any, smooth_values: Any) -> Any:
         equations, batch = parts.inputs(each, common)
+        values = eqx.combine(smooth_values, others)
         start = run.start._replace(trajectory=run.start.trajectory._replace(y=first))
         outcome = run.outcome._replace(y=last)
         new = run._replace(start=start, outcome=outcome, values=values)
         return eqx.filter(saved_rows(equations.saveat.subs, batch, new), eqx.is_inexact_array)
 
-    handed_out = run.start.trajectory.y, run.outcome.y, run.values
+    handed_out = run.start.trajectory.y, run.outcome.y, smooth_values
     rows, pullback = jax.vjp(saved, parts.each, parts.common, *handed_out)
     bar = jtu.tree_map(lambda x, b: jnp.zeros_like(x) if b is None else b, rows, bar)
     each, common, *bars = pullback(bar)
