@@ -14,6 +14,7 @@ from diffrax._heuristics import (
 from diffrax._integrate import (
     loop as diffrax_loop,  # what an adjoint has to run  # noqa: F401
     SaveState as SaveState,  # what has been saved so far
+    State as LoopState,  # what a solve carries from step to step: the type checker knows its fields
 )
 from diffrax._saveat import save_y as save_y  # marks "save the state itself" in SubSaveAt.fn
 from diffrax._solution import (
@@ -77,7 +78,7 @@ def messages_of_results() -> list[str]:
     return list(RESULTS._index_to_message)  # pyright: ignore
 
 
-def save_states(state: Any) -> list[SaveState]:
+def save_states(state: LoopState) -> list[SaveState]:
     """What a solve has saved so far, one per `SubSaveAt`."""
     is_save_state = lambda x: isinstance(x, SaveState)
     leaves = jtu.tree_leaves(state.save_state, is_leaf=is_save_state)

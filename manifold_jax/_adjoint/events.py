@@ -12,7 +12,14 @@ import optimistix as optx
 from diffrax import RESULTS
 from jaxtyping import Array, Bool, Float
 
-from .._compat import nonlinear_failure, SaveState, time_direction, unvmap_any, update_result
+from .._compat import (
+    LoopState,
+    nonlinear_failure,
+    SaveState,
+    time_direction,
+    unvmap_any,
+    update_result,
+)
 from .._custom_types import Args, BoolScalar, FloatScalar, IntScalar, Y
 from .._solver.base import AbstractManifoldSolver
 
@@ -59,17 +66,19 @@ class _Ending(NamedTuple):
 class _LastStep:
     """The step in which a solve ended, and the events in it."""
 
-    def __init__(self, event: dfx.Event, final_state: Any, args: Args, given: dict[str, Any]):
+    def __init__(self, event: dfx.Event, final_state: LoopState, args: Args, given: dict[str, Any]):
         self.args, self.given, self.root_finder = args, given, event.root_finder
         self.events = jtu.tree_leaves(event.cond_fn, is_leaf=callable)
         self.directions = jtu.tree_leaves(event.direction, is_leaf=lambda x: x is None)
         self.after = [jnp.asarray(v) for v in jtu.tree_leaves(final_state.event_values)]
         self.mask = jnp.stack(jtu.tree_leaves(final_state.event_mask))
         self.happened = jnp.any(self.mask)
-        self.start = lax.stop_gradient(final_state.event_tprev)
-        self.end = lax.stop_gradient(final_state.event_tnext)
+        self.start: Any = lax.stop_gradient(final_state.event_tprev)
+        self.end: Any = lax.stop_gradient(final_state.event_tnext)
         self.interpolation = given["solver"].interpolation_cls(
-            t0=self.start, t1=self.end, **final_state.event_dense_info
+            t0=self.start,
+            t1=self.end,
+            **final_state.event_dense_info,  # pyright: ignore[reportCallIssue]
         )
 
     def first(self) -> tuple[FloatScalar, Bool[Array, " events"], RESULTS]:

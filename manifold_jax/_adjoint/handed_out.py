@@ -4,7 +4,7 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 
-from .._compat import save_states
+from .._compat import LoopState, save_states
 from .replay import memory_of, State, with_memory
 
 
@@ -20,7 +20,7 @@ class HandedOut(NamedTuple):
     state: State
 
     @staticmethod
-    def of(final_state: Any, remembers: bool) -> "HandedOut":
+    def of(final_state: LoopState, remembers: bool) -> "HandedOut":
         saved = save_states(final_state)
         memory = memory_of(final_state.solver_state) if remembers else None
         return HandedOut(
@@ -32,7 +32,7 @@ class HandedOut(NamedTuple):
             State(final_state.y, memory),
         )
 
-    def put_into(self, final_state: Any) -> Any:
+    def put_into(self, final_state: LoopState) -> LoopState:
         put = lambda s, *new: eqx.tree_at(lambda s: (s.ts, s.ys), s, new, is_leaf=_is_none)
         saved = zip(save_states(final_state), self.ts, self.ys, strict=True)
         final_state = eqx.tree_at(save_states, final_state, [put(*of) for of in saved])

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, Float
 
-from .._compat import buffer_at_set, MaybeBuffer, unvmap_max, while_loop
+from .._compat import buffer_at_set, LoopState, MaybeBuffer, unvmap_max, while_loop
 from .._custom_types import IntScalar
 from .sizes import Sizes
 
@@ -106,12 +106,13 @@ def recording(record: Record, of: Callable[[Any], Any], run: Callable) -> tuple[
         nonlocal written
 
         def step(carry):
+            state: LoopState
             state, record = carry
-            new = body_fun(state)
+            new: LoopState = body_fun(state)
             accepted = new.num_accepted_steps > state.num_accepted_steps
             row = [state.tprev, jnp.where(accepted, state.tnext, -jnp.inf)]
             if record.jumps:
-                row.append(jnp.asarray(state.made_jump, state.tprev.dtype))
+                row.append(jnp.asarray(state.made_jump, state.tprev.dtype))  # pyright: ignore[reportAttributeAccessIssue]
             x = record.packing.pack(of(state))
             return new, record.including(unvmap_max(state.num_steps), jnp.stack(row), x)
 

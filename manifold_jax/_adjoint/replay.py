@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array
 
+from .._compat import LoopState
 from .._custom_types import Args, RealScalarLike, Y
 from .._projection_info import ProjectionInfo
 from .._solver.advance import HookState
@@ -85,7 +86,7 @@ class Solve(NamedTuple):
     jumps: bool  # whether steps may begin behind jumps of the field
 
     @staticmethod
-    def of(terms: Any, solver: Any, args: Args, init_state: Any, controller: Any) -> "Solve":
+    def of(terms: Any, solver: Any, args: Args, init_state: LoopState, controller: Any) -> "Solve":
         times = init_state.tprev, init_state.tnext
         # The step of a solver of Diffrax itself is written out, and then remembers nothing.
         execution = execution_of(solver, terms, *times, init_state.y, args)
@@ -94,7 +95,7 @@ class Solve(NamedTuple):
         solver_state = lax.stop_gradient(init_state.solver_state)
         return Solve(terms, solver, args, solver_state, not written_out, jumps)
 
-    def state(self, loop_state: Any) -> State:
+    def state(self, loop_state: LoopState) -> State:
         return State(loop_state.y, memory_of(loop_state.solver_state) if self.remembers else None)
 
     def attempt(

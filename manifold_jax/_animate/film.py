@@ -19,7 +19,7 @@ from .._compare.with_diffrax import LAST_MAX_STEPS, SOLVERS
 from .sketches import SKETCHES
 
 
-_RATE = 20  # pictures in a second
+_RATE, _DPI = 20, 75  # pictures in a second, dots in an inch
 _SHOWN = {"plain": ("plain", "tab:red"), "projected": ("projected", "tab:blue")}
 
 
@@ -37,11 +37,11 @@ def write_film(path: Path, task: Task, seconds: float) -> list[Take]:
     times = task.t1 - seconds + np.arange(round(seconds * _RATE)) / _RATE
     takes = [_take(task, one, times) for one in APPROACHES if one.name in _SHOWN]
     matplotlib.use("Agg")
-    figure = Figure(figsize=(7.2, 3.9), layout="constrained")
+    figure = Figure(figsize=(7.2, 4.0), dpi=_DPI, layout="constrained")
     axes = figure.subplots(1, 2, sharex=True, sharey=True)
     artists = [_draw(ax, take) for ax, take in zip(axes, takes, strict=True)]
     _set_limits(axes[0], takes)
-    title = figure.suptitle(" ")
+    title = figure.suptitle(task.problem.name)
     figure.draw_without_rendering()
     figure.set_layout_engine("none")  # nothing moves but the mechanism
 
@@ -54,7 +54,7 @@ def write_film(path: Path, task: Task, seconds: float) -> list[Take]:
         return []
 
     animation = FuncAnimation(figure, show, frames=len(times))
-    animation.save(path, PillowWriter(fps=_RATE), dpi=75)
+    animation.save(path, PillowWriter(fps=_RATE), dpi=_DPI)
     return takes
 
 
