@@ -36,7 +36,9 @@ class Diagnosis(NamedTuple):
         constraint: AbstractConstraint, t: RealScalarLike, y: Y, args: Args, info: ProjectionInfo
     ) -> "Diagnosis":
         """What applies if a correction of `y` failed with this outcome."""
-        cause = jnp.where(jnp.isfinite(info.residual), jnp.where(info.full_rank, 2, 1), 0)
+        # Infinite is the residual of an equation that is scaled by a gradient of zero.
+        cause = jnp.where(jnp.isnan(info.residual), 0, jnp.where(info.full_rank, 2, 1))
+        cause = jnp.where(jnp.isinf(info.residual), 1, cause)
         messages = _MESSAGES
         for applies, message in constraint.faults(t, y, args):
             cause = jnp.where(applies, len(messages), cause)

@@ -188,6 +188,10 @@ def test_failure_is_reported_and_leaves_the_point():
         (NOWHERE.function, "`y` could not be made consistent"),
         (lambda t, y, args: jnp.log(y[0] - 1.0), "not finite"),
         (lambda t, y, args: jnp.stack([y[0], 2 * y[0]]), "full rank at `y`"),
+        (
+            lambda t, y, args: (y[0] - 0.3) ** 2 + (y[1] - 0.4) ** 2 - 1,
+            "or `y` is a singular point",
+        ),
     ],
 )
 def test_failure_raises(residual, message):
