@@ -87,8 +87,10 @@ def unknowns_with_derivatives(
             function, (t, z), (jnp.ones_like(t), layout.rate()(z, leading(t, z)))
         )[1]
 
-    t, function, found = as_time(t, z.dtype), lambda t, z: layout.jet(0)(z, leading(t, z)), []
-    for _ in range(number + 1):
+    further = layout.most_beyond(number)
+    t, function, found = as_time(t, z.dtype), leading, []
+    for _ in range(further + 1):
         found.append(function(t, z))
         function = differentiated(function)
-    return found
+    known = jnp.concatenate(found)
+    return [layout.jet(k, further)(z, known) for k in range(number + 1)]
