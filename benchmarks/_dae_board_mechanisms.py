@@ -98,7 +98,9 @@ def _rings() -> np.ndarray:
     for number, height, turn, first in rings:
         angle = 2 * np.pi * (np.arange(number) + first) / number + np.pi / turn
         up = np.full(number, np.pi * height)
-        points.append(np.stack([np.cos(angle) * np.cos(up), np.sin(angle) * np.cos(up), np.sin(up)], 1))
+        points.append(
+            np.stack([np.cos(angle) * np.cos(up), np.sin(angle) * np.cos(up), np.sin(up)], 1)
+        )
     return np.concatenate(points)
 
 
@@ -222,7 +224,12 @@ def slider_crank() -> BoardProblem:
     }
     end = {
         "p": [np.nan, -0.331173498825626, 0.169737332842786],
-        "q": [0.1893192899613509e-3, 0.2375751249879174e-4, -0.5323896770569702e-5, -0.8363313279112129e-5],
+        "q": [
+            0.1893192899613509e-3,
+            0.2375751249879174e-4,
+            -0.5323896770569702e-5,
+            -0.8363313279112129e-5,
+        ],
         "force": [-62.32935833287916, -163.7920993367306, 25.29857947066878],
     }
     return BoardProblem(

@@ -4,8 +4,6 @@ Source of equations and end values: Mazzia & Magherini, Test Set for Initial Val
 (2008), problems `orego`, `rober`, `chemakzo`, `water` and `tba`.
 """
 
-from typing import Any
-
 import jax.numpy as jnp
 import numpy as np
 

@@ -59,7 +59,15 @@ def contact(side: float, p: Any, psi: Any, xi: Any) -> Contact:
 
 
 def creep_force(
-    side: float, at: Contact, friction: Any, normal: Any, p: Any, v: Any, rate: Any, psi: Any, xi: Any
+    side: float,
+    at: Contact,
+    friction: Any,
+    normal: Any,
+    p: Any,
+    v: Any,
+    rate: Any,
+    psi: Any,
+    xi: Any,
 ) -> Any:
     """Of the rail on the wheel, by Kalker's linear theory with saturation."""
     sp, cp, s, c = jnp.sin(p[4]), jnp.cos(p[4]), jnp.sin(psi), jnp.cos(psi)
@@ -150,8 +158,20 @@ def wheelset() -> BoardProblem:
         "force": np.array([-0.83593e-2, -0.74144e-2]),
     }
     end = {
-        "p": [0.86355386965811e-2, 0.13038281022727e-4, -0.93635784016818e-4, -0.13642299804033e-1, 0.15292895005422e-2],
-        "v": [-0.76985374142666e-1, -0.25151106429207e-3, 0.20541188079539e-2, -0.23904837703692, -0.13633468454173e-1],
+        "p": [
+            0.86355386965811e-2,
+            0.13038281022727e-4,
+            -0.93635784016818e-4,
+            -0.13642299804033e-1,
+            0.15292895005422e-2,
+        ],
+        "v": [
+            -0.76985374142666e-1,
+            -0.25151106429207e-3,
+            0.20541188079539e-2,
+            -0.23904837703692,
+            -0.13633468454173e-1,
+        ],
         "rate": -0.24421377661131,
         "left": [-0.33666751972196e-3, -0.15949425684022],
         "right": [0.37839614386969e-3, 0.14173214964613],

@@ -41,6 +41,16 @@ class Layout(NamedTuple):
     def num_states(self) -> int:
         return len(self.names)
 
+    def leading_names(self) -> np.ndarray:
+        """Of the leading derivatives, each under the name with the fewest derivatives."""
+        found = []
+        for j, root in enumerate(self.aliases.roots.tolist()):
+            order = self.structure.d[j] - self.aliases.shift
+            (names,) = np.nonzero((self.aliases.root == root) & (order >= 0))
+            unknown = names[np.argmin(order[names])]
+            found.append((order[unknown], unknown))
+        return np.array(found, int).reshape(-1, 2)
+
     @staticmethod
     def of(structure: Structure, aliases: Aliases, order: int) -> "Layout":
         """The user's own unknowns first, in their order, then derivatives without a name."""

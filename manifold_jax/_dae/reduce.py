@@ -1,7 +1,7 @@
 """From equations to a vector field on a manifold."""
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.flatten_util as jfu
@@ -28,7 +28,12 @@ from .system import ReducedDAE
 
 
 def reduce_dae(
-    F: Callable, x_example: Y, args_example: Args = None, *, order: int = 1
+    F: Callable,
+    x_example: Y,
+    args_example: Args = None,
+    *,
+    order: int = 1,
+    form: Literal["ode", "index-1"] = "ode",
 ) -> ReducedDAE:
     r"""Reduce a differential-algebraic equation of any index,
 
@@ -68,6 +73,10 @@ def reduce_dae(
         whether the reduced equations are regular; arrays closed over by `F` are constants, whose
         zeros count as structure.
     - `order`: the highest derivative among the arguments of `F`, 1 to 3.
+    - `form`: `"ode"` solves for the derivatives, for any solver. `"index-1"` leaves the equations for
+        them to [`Rodas5P`][], as unknowns of their own behind the state: for stiff equations, and
+        where they are nonlinear in their highest derivatives or multipliers (friction, diodes),
+        which then need not become states.
 
     **Returns:**
 
@@ -89,11 +98,14 @@ def reduce_dae(
 
     Source: J. D. Pryce, A simple structural analysis method for DAEs, BIT 41 (2001) 364-394.
     """
+    if form not in ("ode", "index-1"):
+        raise ValueError(f"`form` must be 'ode' or 'index-1', got {form!r}.")
+    implicit = form == "index-1"
     _check_concrete(x_example, args_example)
     equations = Equations.of(F, x_example, args_example, order)
     x = jfu.ravel_pytree(jtu.tree_map(jnp.asarray, x_example))[0]
     point = Point.of(equations, x, args_example)
-    found = _Analysis.of(equations, Occurrence.of(equations, point), point)
+    found = _Analysis.of(equations, Occurrence.of(equations, point), point, implicit)
     if found is None:
         raise ValueError(_structurally_singular(equations, Occurrence.of(equations, point)))
     found = _without_cancellations(found, point)
@@ -103,7 +115,9 @@ def reduce_dae(
     varies = _at(found.aliases.merged(found.occurrence.varies), found.layout.structure.sigma)
     constant = found.layout.structure.leading & ~varies
     elimination = Elimination.of(constant, found.samples.matrices)
-    plan = Plan(found.layout, found.entries, elimination, order, found.unlifted)
+    plan = Plan(
+        found.layout, found.entries, elimination, order, found.unlifted, np.asarray(x), implicit
+    )
     return ReducedDAE(Reduced(found.equations, Static(plan)), report)
 
 
@@ -118,9 +132,12 @@ class _Analysis(NamedTuple):
     layout: Layout
     entries: Compressed
     samples: Samples
+    implicit: bool
 
     @staticmethod
-    def of(equations: Equations, occurrence: Occurrence, point: Point) -> "_Analysis | None":
+    def of(
+        equations: Equations, occurrence: Occurrence, point: Point, implicit: bool
+    ) -> "_Analysis | None":
         """`None` if the structure is singular."""
         written = Structure.of(signature(occurrence.there))
         if written is None:
@@ -129,12 +146,12 @@ class _Analysis(NamedTuple):
         there = aliases.merged(occurrence.there)
         unlifted = Structure.of(signature(there))
         assert unlifted is not None
-        structure = lifted(equations, aliases, unlifted, point)
+        structure = unlifted if implicit else lifted(equations, aliases, unlifted, point)
         layout = Layout.of(structure, aliases, equations.order)
         entries = Compressed.of(structure, aliases, there, equations.order + 1)
-        samples = Samples.of(equations, layout, entries, point)
+        samples = Samples.of(equations, layout, entries, point, implicit)
         return _Analysis(
-            equations, occurrence, written, aliases, unlifted, layout, entries, samples
+            equations, occurrence, written, aliases, unlifted, layout, entries, samples, implicit
         )
 
     def report(self) -> DAEReport:
@@ -145,6 +162,7 @@ class _Analysis(NamedTuple):
             self.unlifted,
             self.layout,
             self.samples,
+            self.implicit,
         )
 
 
@@ -165,7 +183,7 @@ def _without_cancellations(found: _Analysis, point: Point) -> _Analysis:
         occurrence = Occurrence.of(equations, point).without(
             found.occurrence, repair.combination.row, repair.gone
         )
-        better = _Analysis.of(equations, occurrence, point)
+        better = _Analysis.of(equations, occurrence, point, found.implicit)
         if better is None:
             return found
         found = better
