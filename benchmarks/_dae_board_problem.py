@@ -15,7 +15,8 @@ class BoardProblem(NamedTuple):
     - `floor`: errors are relative to the published number, or to this where that is larger.
     - `jumps`: times at which a derivative of `F` by time jumps.
     - `parameter`: the number in `args`, a mapping, by which is differentiated; over the time
-      `short`, if that is given.
+      `short`, if that is given. Empty where that takes too long to compile.
+    - `form`: that of the reduction.
     """
 
     residual: Callable[..., Any]

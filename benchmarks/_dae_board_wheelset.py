@@ -178,5 +178,13 @@ def wheelset() -> BoardProblem:
         "force": [-0.10124044903201e-1, -0.56285630573753e-2],
     }
     return BoardProblem(
-        residual, start, {"friction": 0.12}, 10.0, end, "friction", rtol=1e-8, atol=1e-10, short=0.1
+        residual,
+        start,
+        {"friction": 0.12},
+        10.0,
+        end,
+        "",
+        rtol=1e-8,
+        atol=1e-10,
+        form="index-1",
     )
