@@ -139,7 +139,9 @@ def _found(
         system, closing.t, z, closing.args, np.zeros_like(c), c
     )
     r, G = jacobian(constraint, closing.z)
-    level = jnp.max(jnp.abs(r) / row_scale(G, closing.z), initial=0)
+    level = jnp.zeros((), guess.dtype)  # there may be no state at all
+    if r.size > 0:
+        level = jnp.max(jnp.abs(r) / row_scale(G, closing.z))
     moving = G * jnp.asarray(np.where(fixed, 0, 1), G.dtype)[None, :]
     full_rank = Pivoted.of(gram(G, moving)).full_rank if r.size > 0 else jnp.asarray(True)
     near = level <= NewtonProjection().tolerance_for(z.dtype)
