@@ -123,7 +123,7 @@ def solve(dae, z0, args, **options):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "model, guess, args, states",
+    ("model", "guess", "args", "states"),
     [
         ("diode", jnp.array([0.3, 0.2, 0.0]), models.DIODE_ARGS, 4),
         ("pendulum", jnp.array([1.3, 0.5, 0.6, -0.3, 0.0]), models.PENDULUM_ARGS, 7),
@@ -183,5 +183,5 @@ def test_equations_that_need_their_multiplier():
     y, info = dae.consistent_state(0.0, start, a)
     assert info.success
     np.testing.assert_allclose(dae.outputs(0.0, y, a)[0]["force"], 9.81, rtol=1e-12)
-    x, xdot = dae.outputs(0.0, y, a)
+    _, xdot = dae.outputs(0.0, y, a)
     np.testing.assert_allclose(xdot["v"][0], 1 - 0.2 * 9.81, rtol=1e-12)

@@ -1,7 +1,7 @@
 """From equations to a vector field on a manifold."""
 
 from collections.abc import Callable
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.flatten_util as jfu
@@ -33,7 +33,7 @@ def reduce_dae(
     args_example: Args = None,
     *,
     order: int = 1,
-    form: Literal["ode", "index-1"] = "ode",
+    form: str = "ode",
 ) -> ReducedDAE:
     r"""Reduce a differential-algebraic equation of any index,
 
