@@ -163,7 +163,15 @@ def water_tubes() -> BoardProblem:
     }
     end = {"flow": _WATER_FLOWS, "pressure": _WATER_PRESSURES}
     return BoardProblem(
-        residual, start, {"demand": 1.0}, 61200.0, end, "demand", rtol=1e-9, atol=1e-9, short=3600.0
+        residual,
+        start,
+        {"demand": 1.0},
+        61200.0,
+        end,
+        "demand",
+        rtol=1e-8,
+        atol=1e-11,
+        short=3600.0,
     )
 
 
