@@ -11,6 +11,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+import manifold_jax as mj
+
 from . import _andrews
 from ._dae_board_problem import BoardProblem
 from ._dae_board_tables import FEKETE_POSITIONS
@@ -237,10 +239,52 @@ def slider_crank() -> BoardProblem:
     )
 
 
+def _pendulum_for_casadi(ca: Any) -> tuple[dict[str, Any], dict[str, Any]]:
+    t, force = ca.SX.sym("t"), ca.SX.sym("force")
+    x, xdot = ca.SX.sym("x", 4), ca.SX.sym("xdot", 4)
+    parts = [xdot[0] - x[2], xdot[1] - x[3], xdot[2] + force * x[0], xdot[3] + force * x[1] + 9.81]
+    rod = x[0] ** 2 + x[1] ** 2 - 1
+    written = {"t": t, "x_impl": x, "dx_impl": xdot, "z": force, "alg": ca.vertcat(*parts, rod)}
+    # States (q, v, q'), unknowns (v', q'', force).
+    return written, {"x0": [1.0, 0, 0, 0, 0, 0], "z0": [0.0, -9.81, 0, -9.81, 0]}
+
+
+def pendulum() -> BoardProblem:
+    """Not of SciML's page: for CasADi's own reduction of the index."""
+
+    def residual(t, x, xdot, args):
+        q, v = x["q"], x["v"]
+        return {
+            "kinematics": xdot["q"] - v,
+            "motion": xdot["v"] + x["force"] * q + jnp.array([0.0, 1.0]) * args["gravity"],
+            "rod": q @ q - 1,
+        }
+
+    problem = mj.problems.pendulum(gravity=9.81, t1=10.0)
+    q, v = (np.asarray(part)[-1] for part in problem.reference(np.array([0.0, 10.0])))
+    start = {"q": np.array([1.0, 0.0]), "v": np.zeros(2), "force": np.asarray(0.0)}
+    end = {"q": q, "v": v}
+    return BoardProblem(
+        residual,
+        start,
+        {"gravity": 9.81},
+        10.0,
+        end,
+        "gravity",
+        "Dopri8",
+        1e-8,
+        1e-8,
+        1.0,
+        short=1.0,
+        for_casadi=_pendulum_for_casadi,
+    )
+
+
 def mechanisms() -> dict[str, BoardProblem]:
     return {
         "car axis": car_axis(),
         "Andrews": andrews(),
         "Fekete": fekete(),
         "slider-crank": slider_crank(),
+        "pendulum": pendulum(),
     }

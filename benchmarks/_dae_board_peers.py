@@ -1,5 +1,6 @@
 """Other solvers of DAEs on the problems of the board, each skipped where it is absent: scikit-sundae
-(IDA) and scipy_dae on the same residual, as it is written, from the same consistent start."""
+(IDA) and scipy_dae on the same residual, as it is written, from the same consistent start; CasADi,
+which reduces the index itself, on the pendulum in its own symbols."""
 
 import importlib
 import importlib.util
@@ -33,7 +34,11 @@ class _OutOfPatience(Exception):
     pass
 
 
-PEERS = {"sksundae": "IDA (scikit-sundae)", "scipy_dae": "Radau (scipy_dae)"}
+PEERS = {
+    "sksundae": "IDA (scikit-sundae)",
+    "scipy_dae": "Radau (scipy_dae)",
+    "casadi": "reduced, IDAS (CasADi)",
+}
 
 
 def installed() -> list[str]:
@@ -41,11 +46,13 @@ def installed() -> list[str]:
 
 
 def run_peers(reduction: Reduction) -> list[PeerRow]:
-    solvers = {"sksundae": _ida, "scipy_dae": _scipy_dae}
+    solvers = {"sksundae": _ida, "scipy_dae": _scipy_dae, "casadi": _casadi}
     residual, x0, xdot0 = residual_in_numbers(reduction)
     unravel = jfu.ravel_pytree(reduction.start)[1]
     rows = []
     for name in installed():
+        if name == "casadi" and reduction.problem.for_casadi is None:
+            continue
         before = time.perf_counter()
 
         def timed(t: Any, x: Any, xdot: Any, before: float = before) -> np.ndarray:
@@ -91,3 +98,21 @@ def _scipy_dae(
         residual, (0.0, problem.t1), x0, xdot0, method="Radau", rtol=problem.rtol, atol=problem.atol
     )
     return sol.y[:, -1], len(sol.t) - 1, bool(sol.success)
+
+
+def _casadi(reduction: Reduction, residual: Callable, x0: Any, xdot0: Any) -> tuple[Any, int, bool]:
+    """Its reduction adds the derivatives `q'` to the states `(q, v)`, all of which stay on the
+    manifold only as far as the tolerance goes."""
+    del residual, x0, xdot0
+    ca = importlib.import_module("casadi")
+    problem = reduction.problem
+    written, start = problem.for_casadi(ca)
+    reduced, _ = ca.dae_reduce_index(written, {})
+    explicit, to_written, _ = ca.dae_map_semi_expl(written, reduced)
+    options = {"reltol": problem.rtol, "abstol": problem.atol, "max_num_steps": MAX_STEPS}
+    integrator = ca.integrator("pendulum", "idas", explicit, 0.0, problem.t1, options)
+    out = integrator(**start)
+    q_and_v, _, force = to_written(out["xf"], out["zf"])
+    # In the order of the board's names: force, q, v.
+    end = np.concatenate([np.ravel(force), np.ravel(q_and_v)])
+    return end, int(integrator.stats()["nsteps"]), True

@@ -17,6 +17,7 @@ class BoardProblem(NamedTuple):
     - `parameter`: the number in `args`, a mapping, by which is differentiated; over the time
       `short`, if that is given. Empty where that takes too long to compile.
     - `form`: that of the reduction.
+    - `for_casadi(casadi)`: the equations as CasADi reduces them, and the start of its integrator.
     """
 
     residual: Callable[..., Any]
@@ -33,6 +34,7 @@ class BoardProblem(NamedTuple):
     dt0: float | None = None
     short: float | None = None
     form: str = "ode"
+    for_casadi: Callable[..., Any] | None = None
 
     def digits(self, x: Any) -> float:
         """Correct ones of the worst number."""

@@ -173,7 +173,7 @@ def draw(rows: list[Row], path: Path) -> None:
     capped = lambda digits: min(max(digits, 0.05), 16.0)
     ours = [0.05 if row.digits is None else capped(row.digits) for row in rows]
     axes.barh(places, ours, height=0.55, color="0.8", label="reduce_dae (this library)")
-    for name, marker in zip(PEERS.values(), ("o", "s"), strict=True):
+    for name, marker in zip(PEERS.values(), ("o", "s", "D"), strict=True):
         found = [
             (capped(peer["digits"]), place)
             for row, place in zip(rows, places, strict=True)
@@ -214,7 +214,7 @@ def main(
         print_table(console, rows[-1:])
         if json is not None:
             content = {
-                "environment": environment("scikit-sundae", "scipy_dae"),
+                "environment": environment("scikit-sundae", "scipy_dae", "casadi"),
                 "problems": [dataclasses.asdict(row) for row in rows],
             }
             write_json(json, content)
