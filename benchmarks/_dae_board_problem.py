@@ -45,7 +45,7 @@ class BoardProblem(NamedTuple):
             error = np.abs(np.asarray(x[name]) - published) / size
             known = ~np.isnan(published)
             worst = max(worst, float(np.max(error[known])))
-        return float("inf") if worst == 0 else -float(np.log10(worst))
+        return -float(np.log10(max(worst, 1e-16)))
 
 
 def as_arrays(tree: Any) -> Any:
