@@ -208,18 +208,6 @@ def akzo_nobel(t, x, xdot, a):
     return jnp.stack([*(d - g for d, g in zip(xdot[:5], f)), Ks * y1 * y4 - y6])
 
 
-AKZO_START = (0.444, 0.00123, 0.0, 0.007, 0.0, 115.83 * 0.444 * 0.007)
-# At t = 180. Source: Mazzia & Magherini, Test Set for IVP Solvers (2008), problem chemakzo.
-AKZO_END = (
-    0.1150794920661702,
-    0.1203831471567715e-2,
-    0.1611562887407974,
-    0.3656156421249283e-3,
-    0.1708010885264404e-1,
-    0.4873531310307455e-2,
-)
-
-
 # Robots and cranes.
 ARM_ARGS = {
     **{"m1": 1.0, "m2": 0.8, "l1": 1.0, "l2": 0.9, "g": 9.81, "d": 0.3, "r": 0.5, "w": 1.1},

@@ -24,6 +24,7 @@ SMALLEST = {
     "approaches": dict(problems="pendulum", repeats=1, quick=True),
     "closed_forms": dict(repeats=1),
     "compile_time": dict(compilations=1, repeats=1, only="pendulum"),
+    "dae_board": dict(problems="linear: generator", quick=True, repeats=1),
     "devices": dict(size=4, repeats=1),
     "ensemble": dict(size=4, lanes=2, repeats=1, problems="pendulum", saved=2, pendulums=4),
     "mujoco_peers": dict(),

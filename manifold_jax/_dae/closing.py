@@ -26,11 +26,21 @@ class Plan(NamedTuple):
     elimination: Elimination
     order: int
     unlifted: Structure  # with the fewest differentiations
+    example: np.ndarray  # of x
+    implicit: bool  # whether the equations may be nonlinear in the leading derivatives
 
     def jets(
         self, z: Float[Array, " a"], w: Float[Array, " n"] | None, differentiations: int
     ) -> tuple[Array, ...]:
         return self.layout.jets(z, w, self.order + 1 + differentiations)
+
+    def jets_of_states(self, z: Float[Array, " a"], differentiations: int) -> tuple[Array, ...]:
+        """For equations of states alone. The others, evaluated with them, have to stay finite: for
+        unknowns that are not states the example is taken."""
+        x, *others = self.jets(z, None, differentiations)
+        known = self.layout.jet(0).index
+        known = (known >= 0) & (known < self.layout.num_states)
+        return jnp.where(known, x, jnp.asarray(self.example, x.dtype)), *others
 
     def rows_below(self, k: int) -> np.ndarray:
         """Equations that are differentiated more than `k` times: `F^(k)` holds of states alone."""
@@ -49,7 +59,8 @@ class Static:
 
 
 class Closing(AbstractEquations):
-    """`F_i^(c_i) = 0`, linear in the leading derivatives `w_j = x_j^(d_j)`, at one state."""
+    """`F_i^(c_i) = 0` for the leading derivatives `w_j = x_j^(d_j)`, linear in them unless the form
+    is implicit, at one state."""
 
     equations: Equations
     t: Array
@@ -73,16 +84,17 @@ class Closing(AbstractEquations):
         return pick(jnp.concatenate(parts), np.argsort(np.argsort(c, kind="stable")))
 
     def linearize(self, x: Float[Array, " n"]) -> Eliminated:
-        """The same for all `w`."""
-        del x
         plan = self.static.plan
-        jets = plan.jets(self.z, None, 0)
-        derivatives = plan.entries.derivatives(self.equations, self.t, jets, self.args)
-        return Eliminated.of(plan.elimination, plan.entries, derivatives)
+        return Eliminated.of(plan.elimination, plan.entries, self._derivatives(x))
 
-    def matrix(self) -> Float[Array, "n n"]:
-        jets, entries = self.static.plan.jets(self.z, None, 0), self.static.plan.entries
-        return entries.matrix(entries.derivatives(self.equations, self.t, jets, self.args))
+    def matrix(self, w: Float[Array, " n"] | None = None) -> Float[Array, "n n"]:
+        return self.static.plan.entries.matrix(self._derivatives(w))
+
+    def _derivatives(self, w: Float[Array, " n"] | None) -> Array:
+        """The same for all `w` unless the form is implicit."""
+        plan = self.static.plan
+        jets = plan.jets(self.z, w if plan.implicit else None, 0)
+        return plan.entries.derivatives(self.equations, self.t, jets, self.args)
 
     def solve(self) -> Float[Array, " n"]:
         """NaN where the equations do not determine all of them. The derivative is that of the

@@ -35,6 +35,13 @@ class Reduced(eqx.Module):
     def closing(self, t: Any, z: Array, args: Args) -> Closing:
         return Closing(self.equations, as_time(t, z.dtype), z, args, self.static)
 
+    def split(self, y: Float[Array, " n"]) -> tuple[Array, Array | None]:
+        """The state `z`, and the leading derivatives where they belong to it."""
+        if not self.static.plan.implicit:
+            return y, None
+        states = self.static.plan.layout.num_states
+        return y[:states], y[states:]
+
 
 class ReducedConstraint(AbstractConstraint):
     """`F_i = 0, F_i' = 0, ..., F_i^(c_i - 1) = 0`: what the equations and their derivatives say
@@ -45,11 +52,13 @@ class ReducedConstraint(AbstractConstraint):
 
     def __call__(self, t: RealScalarLike, y: Y, args: Args = None) -> Float[Array, " m"]:
         c = self.system.static.plan.layout.structure.c
-        return hidden_constraints(self.system, t, y, args, np.zeros_like(c), c)
+        z, _ = self.system.split(y)
+        return hidden_constraints(self.system, t, z, args, np.zeros_like(c), c)
 
     def faults(self, t, y, args=None) -> tuple[tuple[BoolScalar, str], ...]:
-        closing = self.system.closing(t, jfu.ravel_pytree(y)[0], args)
-        return ((~closing.linearize(closing.z).full_rank, _SINGULAR),)
+        z, w = self.system.split(jfu.ravel_pytree(y)[0])
+        closing = self.system.closing(t, z, args)
+        return ((~closing.linearize(z if w is None else w).full_rank, _SINGULAR),)
 
 
 def hidden_constraints(
@@ -60,7 +69,7 @@ def hidden_constraints(
     rows, order = plan.layout.aliases.rows, int(end.max(initial=0)) - 1
     if order < 0:
         return jnp.zeros((0,), z.dtype)
-    jets = plan.jets(z, None, order)
+    jets = plan.jets_of_states(z, order)
     levels = total_derivatives(system.equations, t, jets, args, order)
     parts = [pick(levels[k], rows[(first <= k) & (k < end)]) for k in range(order + 1)]
     return jnp.concatenate(parts)
@@ -72,11 +81,12 @@ def rate(system: Reduced, t: Any, z: Array, args: Args) -> Float[Array, " a"]:
 
 
 def unknowns_with_derivatives(
-    system: Reduced, t: Any, z: Array, args: Args, number: int
+    system: Reduced, t: Any, y: Array, args: Args, number: int
 ) -> list[Float[Array, " n"]]:
     """`x, x', ...` up to that derivative, by differentiating along the solution."""
     layout = system.static.plan.layout
-    w = system.closing(t, z, args).solve()
+    z, w = system.split(y)
+    w = system.closing(t, z, args).solve() if w is None else w
 
     def leading(t: Array, z: Array) -> Array:
         """Solved for only once: nearby, the same as the function that the equations define."""
@@ -87,8 +97,10 @@ def unknowns_with_derivatives(
             function, (t, z), (jnp.ones_like(t), layout.rate()(z, leading(t, z)))
         )[1]
 
-    t, function, found = as_time(t, z.dtype), lambda t, z: layout.jet(0)(z, leading(t, z)), []
-    for _ in range(number + 1):
+    further = layout.most_beyond(number)
+    t, function, found = as_time(t, z.dtype), leading, []
+    for _ in range(further + 1):
         found.append(function(t, z))
         function = differentiated(function)
-    return found
+    known = jnp.concatenate(found)
+    return [layout.jet(k, further)(z, known) for k in range(number + 1)]

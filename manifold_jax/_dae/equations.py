@@ -1,6 +1,8 @@
 """The equations `F(t, x, x', ..., args) = 0` as a function of vectors."""
 
+import functools
 import itertools
+import operator
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -18,6 +20,13 @@ from .._user_function import check_function
 from .names import number_names
 
 
+class Combination(NamedTuple):
+    """Equation `row` replaced by the sum of `weight * equation` over `parts`."""
+
+    row: int
+    parts: tuple[tuple[int, float], ...]
+
+
 class Equations(eqx.Module):
     """`n` equations in `n` unknowns and their derivatives up to `order`."""
 
@@ -25,6 +34,7 @@ class Equations(eqx.Module):
     order: int = eqx.field(static=True)
     shapes: Any = eqx.field(static=True)  # of `x`, a pytree of jax.ShapeDtypeStruct, hashable
     names: "Names" = eqx.field(static=True)
+    combinations: tuple[Combination, ...] = eqx.field(static=True, default=())
 
     @property
     def n(self) -> int:
@@ -42,7 +52,16 @@ class Equations(eqx.Module):
     def __call__(self, t: Array, jets: tuple[Array, ...], args: Args) -> Float[Array, " n"]:
         """At the vectors `(x, x', ...)`."""
         residual = self.function(t, *(self.unravel(x) for x in jets[: self.order + 1]), args)
-        return jfu.ravel_pytree(residual)[0].astype(jets[0].dtype)
+        values = jfu.ravel_pytree(residual)[0].astype(jets[0].dtype)
+        for row, parts in self.combinations:
+            total = functools.reduce(operator.add, [w * values[i : i + 1] for i, w in parts])
+            values = jnp.concatenate([values[:row], total, values[row + 1 :]])
+        return values
+
+    def combined(self, combination: Combination) -> "Equations":
+        names = self.names.combined(combination)
+        every = (*self.combinations, combination)
+        return Equations(self.function, self.order, self.shapes, names, every)
 
     @staticmethod
     def of(function: Callable, x: Any, args: Args, order: int) -> "Equations":
@@ -67,6 +86,16 @@ class Names(NamedTuple):
 
     def derivative(self, unknown: int, order: int) -> str:
         return self.unknowns[unknown] + "'" * order
+
+    def combined(self, combination: Combination) -> "Names":
+        text = ""
+        for i, weight in combination.parts:
+            size = "" if abs(weight) == 1 else f"{abs(weight):.3g} "
+            sign = " - " if weight < 0 else " + " if text else ""
+            text += (sign if text else sign.strip()) + size + self.equations[i]
+        equations = [*self.equations]
+        equations[combination.row] = text
+        return Names(tuple(equations), self.unknowns)
 
 
 def _check_order(order: Any) -> None:

@@ -18,7 +18,8 @@ from .._newton import without_derivative
 from .._projection import NewtonProjection
 from .._projection_info import ProjectionInfo
 from .._residual import as_time, jacobian, row_scale
-from .constraint import Reduced, ReducedConstraint
+from .constraint import hidden_constraints, Reduced
+from .implicit import leading
 from .layout import Gather, Layout
 from .names import leaf_names, listed
 from .nearest import nearest_state, with_lifted
@@ -30,6 +31,7 @@ class Guess(NamedTuple):
     """A state, and which of its numbers may not move."""
 
     z: Float[Array, " states"]
+    w: Float[Array, " n"]  # leading derivatives
     fixed: np.ndarray
     names: tuple[str, ...]  # of what is fixed, as given
 
@@ -37,16 +39,20 @@ class Guess(NamedTuple):
     def of(system: Reduced, x: Y, derivatives: Any, fixed: Any) -> "Guess":
         given = [_flat(system, x, "x_guess")]
         given += [_flat(system, dx, f"derivatives[{k}]") for k, dx in enumerate(derivatives)]
-        z = _places_in_guess(system.static.plan.layout, len(given))(jnp.concatenate(given), None)
-        return Guess(z, _fixed(system, x, fixed), tuple(fixed))
+        layout, every = system.static.plan.layout, jnp.concatenate(given)
+        z, w = (
+            _places_in_guess(layout, names, len(given))(every, None)
+            for names in (layout.names, layout.leading_names())
+        )
+        return Guess(z, w, _fixed(system, x, fixed), tuple(fixed))
 
 
-def _places_in_guess(layout: Layout, number: int) -> Gather:
-    """Where each number of the state is in the guesses of `x, x', ...`, as many as are given: under
-    its own name, or as a derivative of another unknown."""
+def _places_in_guess(layout: Layout, names: np.ndarray, number: int) -> Gather:
+    """Where each of these numbers is in the guesses of `x, x', ...`, as many as are given: under its
+    own name, or as a derivative of another unknown."""
     aliases, n = layout.aliases, len(layout.aliases.root)
     index, scale = [], []
-    for k, unknown in layout.names.tolist():
+    for k, unknown in names.tolist():
         level = k + aliases.shift[unknown] - aliases.shift
         (others,) = np.nonzero(
             (aliases.root == aliases.root[unknown]) & (level >= 0) & (level < number)
@@ -98,9 +104,9 @@ def consistent_state(
     system: Reduced, t0: RealScalarLike, guess: Guess, args: Args, throw: bool
 ) -> tuple[Array, ProjectionInfo]:
     t = as_time(t0, guess.z.dtype)
-    z, info, regular = _found(system, t, guess.z, tuple(guess.fixed.tolist()), args)
+    z, info, regular = _found(system, t, guess.z, guess.w, tuple(guess.fixed.tolist()), args)
     if throw:
-        _explain(system, t, z, args, guess, info, regular)
+        _explain(system, t, system.split(z)[0], args, guess, info, regular)
         near = info.residual <= NewtonProjection().tolerance_for(z.dtype)
         cause = jnp.where(info.full_rank, jnp.where(near, 2, 1), 0)
         cause = jnp.where(info.success, 0, cause)
@@ -116,7 +122,7 @@ def _raise_unless(success: BoolScalar, z: Array, cause: Array, messages: tuple[s
 
 @eqx.filter_jit
 def _found(
-    system: Reduced, t: Array, guess: Array, held: tuple[bool, ...], args: Args
+    system: Reduced, t: Array, guess: Array, w: Array, held: tuple[bool, ...], args: Args
 ) -> tuple[Array, ProjectionInfo, BoolScalar]:
     """The state, what was done, and whether the derivatives are determined there."""
     fixed = np.array(held, bool)
@@ -124,15 +130,23 @@ def _found(
     guess = jnp.where(finite, guess, 0)
     nearest = nearest_state(system, t, guess, fixed, args)
     z = with_lifted(system, t, nearest.z, args)
-    closing = without_derivative(system.closing(t, z, args))
-    regular = closing.linearize(closing.z).full_rank
-    constraint = lambda z: ReducedConstraint(system=system)(closing.t, z, closing.args)
+    solvable = jnp.asarray(True)
+    if system.static.plan.implicit:
+        w, solvable = leading(system.closing(t, z, args), w)
+    closing, fixed_w = without_derivative((system.closing(t, z, args), w))
+    regular = closing.linearize(fixed_w).full_rank
+    c = system.static.plan.layout.structure.c
+    constraint = lambda z: hidden_constraints(
+        system, closing.t, z, closing.args, np.zeros_like(c), c
+    )
     r, G = jacobian(constraint, closing.z)
-    level = jnp.max(jnp.abs(r) / row_scale(G, closing.z), initial=0)
+    level = jnp.zeros((), guess.dtype)  # there may be no state at all
+    if r.size > 0:
+        level = jnp.max(jnp.abs(r) / row_scale(G, closing.z))
     moving = G * jnp.asarray(np.where(fixed, 0, 1), G.dtype)[None, :]
     full_rank = Pivoted.of(gram(G, moving)).full_rank if r.size > 0 else jnp.asarray(True)
     near = level <= NewtonProjection().tolerance_for(z.dtype)
-    success = finite & near & nearest.settled & full_rank & regular
+    success = finite & near & nearest.settled & full_rank & regular & solvable
     correction = jnp.max(jnp.abs(closing.z - guess) / (jnp.abs(guess) + 1), initial=0)
     info = ProjectionInfo(
         multipliers=nearest.multipliers,
@@ -142,7 +156,8 @@ def _found(
         full_rank=full_rank,
         success=success,
     )
-    return jnp.where(finite, z, given), info, regular
+    z = jnp.where(finite, z, given)
+    return jnp.concatenate([z, w]) if system.static.plan.implicit else z, info, regular
 
 
 def _messages(guess: Guess) -> list[str]:

@@ -41,6 +41,16 @@ class Layout(NamedTuple):
     def num_states(self) -> int:
         return len(self.names)
 
+    def leading_names(self) -> np.ndarray:
+        """Of the leading derivatives, each under the name with the fewest derivatives."""
+        found = []
+        for j, root in enumerate(self.aliases.roots.tolist()):
+            order = self.structure.d[j] - self.aliases.shift
+            (names,) = np.nonzero((self.aliases.root == root) & (order >= 0))
+            unknown = names[np.argmin(order[names])]
+            found.append((order[unknown], unknown))
+        return np.array(found, int).reshape(-1, 2)
+
     @staticmethod
     def of(structure: Structure, aliases: Aliases, order: int) -> "Layout":
         """The user's own unknowns first, in their order, then derivatives without a name."""
@@ -65,14 +75,23 @@ class Layout(NamedTuple):
     def _scales(self) -> np.ndarray:
         return np.concatenate([self.scale(), np.ones(len(self.structure.d))])
 
-    def jet(self, k: int) -> Gather:
-        """Derivative `k` of all unknowns."""
-        root = self.aliases.root
-        j = np.searchsorted(self.aliases.roots, root)
+    def jet(self, k: int, further: int = 0) -> Gather:
+        """Derivative `k` of all unknowns, with `further` derivatives of `w` known (behind it)."""
+        d = self.structure.d
+        j = np.searchsorted(self.aliases.roots, self.aliases.root)
         level = k + self.aliases.shift
         inside = level < len(self.places)
         index = np.where(inside, self.places[np.where(inside, level, 0), j], -1)
-        return Gather(index, self.aliases.factor / self._scales()[index])
+        beyond = level - d[j]
+        known = (beyond > 0) & (beyond <= further)
+        index = np.where(known, self.num_states + beyond * len(d) + j, index)
+        scales = np.concatenate([self._scales(), np.ones(further * len(d))])
+        return Gather(index, self.aliases.factor / scales[index])
+
+    def most_beyond(self, k: int) -> int:
+        """Derivatives of `w` that derivative `k` of all unknowns takes."""
+        j = np.searchsorted(self.aliases.roots, self.aliases.root)
+        return max(0, int((k + self.aliases.shift - self.structure.d[j]).max(initial=0)))
 
     def rate(self) -> Gather:
         """The derivative of the state."""

@@ -74,6 +74,13 @@ class Occurrence(NamedTuple):
             unknown_primitives=values.unknown_primitives,
         )
 
+    def without(self, before: "Occurrence", row: int, gone: np.ndarray) -> "Occurrence":
+        """Of equations of which one was replaced: `gone[k, j]` is not in it, the others are those
+        of `before`."""
+        there = before.there.copy()
+        there[row] = self.there[row] & ~gone
+        return self._replace(there=there)
+
 
 def _inputs(point: Point, number: int) -> tuple[tuple[Any, np.ndarray], ...]:
     """The time and all parameters together count as one input each, after those of the jets."""

@@ -1,7 +1,7 @@
 """From equations to a vector field on a manifold."""
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.core
@@ -13,6 +13,7 @@ import numpy as np
 from .._custom_types import Args, Y
 from .aliases import Aliases
 from .closing import Plan, Static
+from .combined import cancelled
 from .compressed import Compressed
 from .constraint import Reduced
 from .equations import Equations
@@ -28,7 +29,12 @@ from .system import ReducedDAE
 
 
 def reduce_dae(
-    F: Callable, x_example: Y, args_example: Args = None, *, order: int = 1
+    F: Callable,
+    x_example: Y,
+    args_example: Args = None,
+    *,
+    order: int = 1,
+    form: str = "ode",
 ) -> ReducedDAE:
     r"""Reduce a differential-algebraic equation of any index,
 
@@ -68,6 +74,10 @@ def reduce_dae(
         whether the reduced equations are regular; arrays closed over by `F` are constants, whose
         zeros count as structure.
     - `order`: the highest derivative among the arguments of `F`, 1 to 3.
+    - `form`: `"ode"` solves for the derivatives, for any solver. `"index-1"` leaves the equations for
+        them to [`Rodas5P`][], as unknowns of their own behind the state: for stiff equations, and
+        where they are nonlinear in their highest derivatives or multipliers (friction, diodes),
+        which then need not become states.
 
     **Returns:**
 
@@ -81,34 +91,104 @@ def reduce_dae(
     structure is not, or under `jit`: structure is found before anything is compiled.
     `TypeError` for arguments of the wrong kind and for `jax.custom_vjp` in `F`.
 
-    Structure cannot see what cancels. Problems of index 1 with a constant singular matrix,
-    `M x' = f(t, x)`, may fail here for that reason; use `mj.MassMatrixTerm` with `mj.Rodas5P`
-    for those. For mechanisms [`MechanicalSystem`][] compiles to less and corrects positions and
+    Structure cannot see what cancels. Where the highest derivatives cancel in a combination of
+    equations with constant weights, as in circuits with loops of capacitors, `M x' = f(t, x)` with
+    a constant singular matrix, the combination takes the place of one of them (`report.equations`
+    says which). Other cancellations are refused. For mechanisms [`MechanicalSystem`][] compiles to less and corrects positions and
     velocities in the metric of the masses.
 
     Source: J. D. Pryce, A simple structural analysis method for DAEs, BIT 41 (2001) 364-394.
     """
+    if form not in ("ode", "index-1"):
+        raise ValueError(f"`form` must be 'ode' or 'index-1', got {form!r}.")
+    implicit = form == "index-1"
     _check_concrete(x_example, args_example)
     equations = Equations.of(F, x_example, args_example, order)
     x = jfu.ravel_pytree(jtu.tree_map(jnp.asarray, x_example))[0]
     point = Point.of(equations, x, args_example)
-    occurrence = Occurrence.of(equations, point)
-    written = _structure(equations, occurrence.there)
-    aliases = Aliases.of(equations, occurrence, point)
-    there = aliases.merged(occurrence.there)
-    unlifted = Structure.of(signature(there))
-    assert unlifted is not None
-    structure = lifted(equations, aliases, unlifted, point)
-    layout = Layout.of(structure, aliases, order)
-    entries = Compressed.of(structure, aliases, there, order + 1)
-    samples = Samples.of(equations, layout, entries, point)
-    report = DAEReport.of(equations, occurrence, written, unlifted, layout, samples)
-    if samples.singular:
-        raise ValueError(_singular(equations, aliases, samples, report))
-    constant = structure.leading & ~_at(aliases.merged(occurrence.varies), structure.sigma)
-    elimination = Elimination.of(constant, samples.matrices)
-    plan = Plan(layout, entries, elimination, order, unlifted)
-    return ReducedDAE(Reduced(equations, Static(plan)), report)
+    found = _Analysis.of(equations, Occurrence.of(equations, point), point, implicit)
+    if found is None:
+        raise ValueError(_structurally_singular(equations, Occurrence.of(equations, point)))
+    found = _without_cancellations(found, point)
+    report = found.report()
+    if found.samples.singular:
+        raise ValueError(_singular(found, report))
+    varies = _at(found.aliases.merged(found.occurrence.varies), found.layout.structure.sigma)
+    constant = found.layout.structure.leading & ~varies
+    elimination = Elimination.of(constant, found.samples.matrices)
+    plan = Plan(
+        found.layout, found.entries, elimination, order, found.unlifted, np.asarray(x), implicit
+    )
+    return ReducedDAE(Reduced(found.equations, Static(plan)), report)
+
+
+class _Analysis(NamedTuple):
+    """What follows from the occurrence of the unknowns."""
+
+    equations: Equations
+    occurrence: Occurrence
+    written: Structure
+    aliases: Aliases
+    unlifted: Structure
+    layout: Layout
+    entries: Compressed
+    samples: Samples
+    implicit: bool
+
+    @staticmethod
+    def of(
+        equations: Equations, occurrence: Occurrence, point: Point, implicit: bool
+    ) -> "_Analysis | None":
+        """`None` if the structure is singular."""
+        written = Structure.of(signature(occurrence.there))
+        if written is None:
+            return None
+        aliases = Aliases.of(equations, occurrence, point)
+        there = aliases.merged(occurrence.there)
+        unlifted = Structure.of(signature(there))
+        assert unlifted is not None
+        structure = unlifted if implicit else lifted(equations, aliases, unlifted, point)
+        layout = Layout.of(structure, aliases, equations.order)
+        entries = Compressed.of(structure, aliases, there, equations.order + 1)
+        samples = Samples.of(equations, layout, entries, point, implicit)
+        return _Analysis(
+            equations, occurrence, written, aliases, unlifted, layout, entries, samples, implicit
+        )
+
+    def report(self) -> DAEReport:
+        return DAEReport.of(
+            self.equations,
+            self.occurrence,
+            self.written,
+            self.unlifted,
+            self.layout,
+            self.samples,
+            self.implicit,
+        )
+
+
+def _without_cancellations(found: _Analysis, point: Point) -> _Analysis:
+    """With combinations of equations from which derivatives are gone, as long as there are some."""
+    while found.samples.singular:
+        repair = cancelled(
+            found.equations,
+            found.occurrence,
+            found.aliases,
+            found.layout,
+            found.samples.matrices,
+            point,
+        )
+        if repair is None:
+            return found
+        equations = found.equations.combined(repair.combination)
+        occurrence = Occurrence.of(equations, point).without(
+            found.occurrence, repair.combination.row, repair.gone
+        )
+        better = _Analysis.of(equations, occurrence, point, found.implicit)
+        if better is None:
+            return found
+        found = better
+    return found
 
 
 def _check_concrete(x: Any, args: Any) -> None:
@@ -120,17 +200,14 @@ def _check_concrete(x: Any, args: Any) -> None:
         )
 
 
-def _structure(equations: Equations, there: np.ndarray) -> Structure:
-    structure = Structure.of(signature(there))
-    if structure is not None:
-        return structure
-    parts, names = SingularParts.of(there.any(axis=1)), equations.names  # pyright: ignore[reportArgumentType]
+def _structurally_singular(equations: Equations, occurrence: Occurrence) -> str:
+    parts, names = SingularParts.of(occurrence.there.any(axis=1)), equations.names
     named = lambda part: (
         listed([names.equations[i] for i in part[0]]),
         listed([names.unknowns[j] for j in part[1]]) or "none",
     )
     over, under = named(parts.overdetermined), named(parts.underdetermined)
-    raise ValueError(
+    return (
         f"`F` is structurally singular. The equations {over[0]} are too many for the unknowns in them: {over[1]}. The "
         f"unknowns {under[1]} are left to too few equations: {under[0] or 'none'}. Replace an equation of the "
         "first part by one for the unknowns of the second."
@@ -143,14 +220,14 @@ def _at(there: np.ndarray, levels: np.ndarray) -> np.ndarray:
     return np.take_along_axis(there, level, axis=1)[:, 0]
 
 
-def _singular(equations: Equations, aliases: Aliases, samples: Samples, report: DAEReport) -> str:
-    rows = aliases.rows[dependent_rows(samples.matrices[0])]
-    names = listed([equations.names.equations[i] for i in rows])
+def _singular(found: _Analysis, report: DAEReport) -> str:
+    rows = found.aliases.rows[dependent_rows(found.samples.matrices[0])]
+    names = listed([found.equations.names.equations[i] for i in rows])
     return (
         f"`F` is structurally regular (index {report.index}, {report.degrees_of_freedom} degrees of freedom), but the "
         f"matrix of its leading derivatives is singular wherever it was evaluated (reciprocal condition "
-        f"{max(samples.conditions):.0e} at best): the equations {names} depend on each other there. Either they are "
+        f"{max(found.samples.conditions):.0e} at best): the equations {names} depend on each other there. Either they are "
         "redundant, or terms cancel that structure cannot see and the index is higher (a hidden index): combine "
-        "those equations so that the cancelled derivatives are gone. For a problem of index 1 with a constant "
-        "singular matrix, M x' = f(t, x), use `mj.MassMatrixTerm` with `mj.Rodas5P`."
+        "those equations so that the cancelled derivatives are gone. For a problem of index 1 with a singular "
+        "matrix, M x' = f(t, x), use `mj.MassMatrixTerm` with `mj.Rodas5P`."
     )

@@ -60,10 +60,14 @@ class DAEReport:
         unlifted: Structure,
         layout: Layout,
         samples: Samples,
+        implicit: bool,
     ) -> "DAEReport":
         names, structure = equations.names, layout.structure
         raised = layout.aliases.roots[structure.d > unlifted.d]
         best = max(samples.conditions)
+        states = (
+            np.concatenate([layout.names, layout.leading_names()]) if implicit else layout.names
+        )
         return DAEReport(
             equations=names.equations,
             unknowns=names.unknowns,
@@ -72,7 +76,7 @@ class DAEReport:
             d=written.d,
             index=written.index,
             degrees_of_freedom=written.degrees_of_freedom,
-            states=tuple(names.derivative(unknown, k) for k, unknown in layout.names.tolist()),
+            states=tuple(names.derivative(unknown, k) for k, unknown in states.tolist()),
             num_constraints=int(structure.c.sum()),
             dropped=tuple(names.equations[i] for i in layout.aliases.equations),
             lifted=tuple(names.unknowns[j] for j in raised),

@@ -31,25 +31,26 @@ class Samples(NamedTuple):
         return max(self.conditions) < singular_below(self.matrices[0].dtype)
 
     @staticmethod
-    def of(equations: Equations, layout: Layout, entries: Compressed, point: Point) -> "Samples":
+    def of(
+        equations: Equations, layout: Layout, entries: Compressed, point: Point, implicit: bool
+    ) -> "Samples":
+        """`implicit`: the matrix may depend on the leading derivatives."""
         nothing = np.zeros(0, int)
+        elimination = Elimination(*[nothing] * 4, 0)
+        example = np.asarray(point.jets[0])
         plan = Plan(
-            layout,
-            entries,
-            Elimination(*[nothing] * 4, 0),  # pyright: ignore[reportCallIssue]
-            equations.order,
-            layout.structure,  # pyright: ignore[reportCallIssue]
+            layout, entries, elimination, equations.order, layout.structure, example, implicit
         )
         static = Static(plan)
 
         @jax.jit
-        def matrix(t: Array, z: Array, args: object) -> Array:
-            args = eqx.combine(args, point.fixed_args)
-            return Closing(equations, t, z, args, static).matrix()
+        def matrix(t: Array, y: Array, args: object) -> Array:
+            args, states = eqx.combine(args, point.fixed_args), layout.num_states
+            return Closing(equations, t, y[:states], args, static).matrix(y[states:])
 
         matrices = []
-        for t, z in _points(layout, np.asarray(point.jets[0])):
-            sample = np.asarray(matrix(t, jnp.asarray(z), point.args))
+        for t, y in _points(layout, np.asarray(point.jets[0])):
+            sample = np.asarray(matrix(t, jnp.asarray(y), point.args))
             if np.isfinite(sample).all():
                 matrices.append(sample)
         if not matrices:
@@ -66,7 +67,7 @@ def singular_below(dtype: np.dtype) -> float:
 
 def _points(layout: Layout, x: np.ndarray) -> list[tuple[Array, np.ndarray]]:
     random = np.random.default_rng(0)
-    order, unknown = layout.names.T
+    order, unknown = np.concatenate([layout.names, layout.leading_names()]).T
     found = []
     for distance in _DISTANCES:
         z = np.where(order == 0, x[unknown], 0)

@@ -10,7 +10,9 @@ from jaxtyping import Array, Float
 from .._constraint_checks import check_state
 from .._custom_types import Args, RealScalarLike, Y
 from .._projection_info import ProjectionInfo
+from .._rosenbrock import MassMatrixTerm
 from .constraint import rate, Reduced, ReducedConstraint, unknowns_with_derivatives
+from .implicit import implicit_field, mass
 from .initial import consistent_state, Guess
 from .report import DAEReport
 
@@ -23,9 +25,11 @@ class ReducedDAE(eqx.Module):
     report: DAEReport = eqx.field(static=True)
 
     @property
-    def terms(self) -> dfx.ODETerm:
-        """The vector field on the state, a Diffrax term. NaN where the equations do not determine
-        it."""
+    def terms(self) -> dfx.ODETerm | MassMatrixTerm:
+        """The vector field on the state, a Diffrax term; NaN where the equations do not determine
+        it. With `form="index-1"` a [`MassMatrixTerm`][] for [`Rodas5P`][] and [`Rodas3P`][]."""
+        if self.system.static.plan.implicit:
+            return MassMatrixTerm(self._implicit_field, mass(self.system.static.plan.layout))
         return dfx.ODETerm(self._field)
 
     @property
@@ -91,6 +95,10 @@ class ReducedDAE(eqx.Module):
     def _field(self, t: RealScalarLike, y: Float[Array, " states"], args: Args) -> Array:
         self._check(y)
         return rate(self.system, t, y, args)
+
+    def _implicit_field(self, t: RealScalarLike, y: Float[Array, " states"], args: Args) -> Array:
+        self._check(y)
+        return implicit_field(self.system, t, y, args)
 
     def _check(self, z: Any) -> None:
         check_state(z, "z")

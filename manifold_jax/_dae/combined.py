@@ -1,0 +1,124 @@
+"""Equations whose highest derivatives cancel in a combination of them.
+
+    C (u' - v') = i(u),   C (v' - u') = j(v)
+
+are regular to the structure, but not solvable for `u'` and `v'`: their sum `0 = i(u) + j(v)` is an
+equation of the unknowns alone. Found where weights and coefficients are constant, and put in the
+place of one of the equations.
+"""
+
+import functools
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from .aliases import Aliases
+from .equations import Combination, Equations
+from .layout import Layout
+from .occurrence import Occurrence, Point
+from .samples import equilibrated, singular_below
+
+
+# Of a sum that should be zero, relative to its parts.
+_ROUNDING = 1e-12
+_POINTS = 3
+
+
+class Cancelled(NamedTuple):
+    """A combination in the place of one of the equations, and what is not in it any more,
+    `gone[k, j]`."""
+
+    combination: Combination
+    gone: np.ndarray
+
+
+def cancelled(
+    equations: Equations,
+    occurrence: Occurrence,
+    aliases: Aliases,
+    layout: Layout,
+    matrices: list[np.ndarray],
+    point: Point,
+) -> Cancelled | None:
+    """Of equations that are differentiated equally often; `None` if there is no such combination
+    that holds for other parameters and times, too."""
+    jacobians = _jacobians(equations, occurrence.there, point)
+    for weights in _common_null_vectors(matrices):
+        (used,) = np.nonzero(weights)
+        if len(used) < 2 or len(set(layout.structure.c[used].tolist())) > 1:
+            continue
+        rows = aliases.rows[used]
+        constant = ~occurrence.varies[rows].any(axis=0)
+        gone = constant & _vanishes(jacobians, rows, weights[used])
+        leading = aliases.merged(gone[None])[0]
+        highest = layout.structure.d - layout.structure.c[used[0]]
+        stands = aliases.merged(occurrence.there[rows].any(axis=0)[None])[0]
+        columns = np.arange(len(highest))
+        inside = highest >= 0
+        at = np.maximum(highest, 0), columns
+        if (inside & stands[at] & ~leading[at]).any():
+            continue
+        target = int(rows[np.argmax(np.abs(weights[used]))])
+        parts = tuple(zip(rows.tolist(), weights[used].tolist(), strict=True))
+        return Cancelled(Combination(target, parts), gone)
+    return None
+
+
+def _vanishes(jacobians: list[np.ndarray], rows: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Where the weighted sum of coefficients is zero at all points, shape `(levels, n)`."""
+    vanishes = np.ones(jacobians[0].shape[1:], bool)
+    for J in jacobians:
+        parts = weights[:, None, None] * J[rows]
+        vanishes &= np.abs(parts.sum(axis=0)) <= _ROUNDING * np.abs(parts).sum(axis=0)
+    return vanishes
+
+
+def _common_null_vectors(matrices: list[np.ndarray]) -> list[np.ndarray]:
+    """With few numbers that are not zero, the largest of them 1."""
+    rows = np.max([np.abs(J).max(axis=1) for J in matrices], axis=0)
+    scale = 1 / np.where(rows > 0, rows, 1)
+    every = equilibrated(np.concatenate([J * scale[:, None] for J in matrices], axis=1))
+    scale = scale / np.maximum(np.abs(every).max(axis=1), 1e-300) if len(every) else scale
+    every = np.concatenate([J * scale[:, None] for J in matrices], axis=1)
+    left, values, _ = np.linalg.svd(every / max(np.abs(every).max(initial=0), 1e-300))
+    values = np.concatenate([values, np.zeros(len(left) - len(values))])
+    null = left[:, values <= singular_below(every.dtype)].T
+    found = []
+    for k in range(len(null)):  # reduced to echelon form
+        column = int(np.argmax(np.abs(null[k])))
+        null[k] = null[k] / null[k, column]
+        others = np.arange(len(null)) != k
+        null[others] -= null[others, column][:, None] * null[k][None, :]
+    for v in null:
+        weights = np.where(np.abs(v) > 1e-9, v, 0) * scale
+        weights = weights / weights[np.argmax(np.abs(weights))]
+        whole = np.rint(weights)
+        found.append(np.where(np.abs(weights - whole) < 1e-9, whole, weights))
+    return found
+
+
+def _jacobians(equations: Equations, there: np.ndarray, point: Point) -> list[np.ndarray]:
+    """By all derivatives, `(n, levels, n)`, at other times, values and parameters."""
+
+    @jax.jit
+    def jacobian(t: Array, jets: tuple[Array, ...], args: object) -> Array:
+        along = lambda jets: equations(t, jets, eqx.combine(args, point.fixed_args))
+        return jnp.stack(jax.jacfwd(along)(jets), axis=1)
+
+    random = np.random.default_rng(1)
+
+    def moved(x: Array, k: int) -> Array:
+        if not jnp.issubdtype(x.dtype, jnp.floating):
+            return x
+        return x * jnp.asarray(1 + 0.1 * k * random.normal(size=x.shape), x.dtype)
+
+    found = []
+    for k in range(_POINTS):
+        args, jets = jax.tree_util.tree_map(functools.partial(moved, k=k), (point.args, point.jets))
+        J = jacobian(jnp.asarray(random.uniform(), point.t.dtype), jets, args)
+        found.append(np.where(there, np.asarray(J), 0))
+    return found

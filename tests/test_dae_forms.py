@@ -1,0 +1,187 @@
+"""What reductions do beside the usual: combinations of equations, equations of index 1, unknowns
+that are higher derivatives."""
+
+import dae_models as models
+import diffrax as dfx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import manifold_jax as mj
+
+
+# Combinations of equations from which derivatives cancel
+
+
+def capacitor_between(t, x, xdot, a):
+    """A capacitor between two nodes, each with a resistor to ground, and a source at the first:
+    `u' - v'` is in both equations."""
+    u, v = x
+    into = a["C"] * (xdot[0] - xdot[1])
+    return jnp.stack([into - (jnp.sin(t) - u) / a["R"], -into + v / a["S"]])
+
+
+CAPACITOR_ARGS = {"C": 0.3, "R": 0.7, "S": 1.1}
+
+
+def capacitor_by_hand(t, v, a):
+    """`v' = u' - v / (S C)` and `v / S = (sin t - u) / R`."""
+    gain = a["R"] / a["S"]
+    return (jnp.cos(t) - v / (a["S"] * a["C"])) / (1 + gain)
+
+
+def test_combination():
+    args = jax.tree.map(jnp.asarray, CAPACITOR_ARGS)
+    dae = mj.reduce_dae(capacitor_between, jnp.ones(2), args)
+    report = dae.report
+    assert (report.index, report.degrees_of_freedom, report.num_constraints) == (1, 1, 1)
+    assert "F[0] + F[1]" in report.equations
+    t, other = 0.4, jax.tree.map(lambda p: 1.3 * p, args)
+    z, info = dae.consistent_state(t, jnp.array([0.2, 0.5]), other)
+    assert info.success
+    rate = dae.terms.vf(t, z, other)
+    np.testing.assert_allclose(rate[1], capacitor_by_hand(t, z[1], other), rtol=1e-13)
+    np.testing.assert_allclose(
+        capacitor_between(t, *dae.outputs(t, z, other), other), 0, atol=1e-14
+    )
+
+
+def test_combination_of_algebraic_unknowns():
+    """`i - j` is in two equations that together leave `v = 1`: index 2."""
+    network = lambda t, x, xdot, a: jnp.stack(
+        [-x[0] + x[1] + a, x[0] - x[1] - x[2], xdot[2] - x[1]]
+    )
+    dae = mj.reduce_dae(network, jnp.zeros(3), jnp.asarray(1.0))
+    assert (dae.report.index, dae.report.degrees_of_freedom) == (2, 0)
+    z, _ = dae.consistent_state(0.0, jnp.zeros(3), jnp.asarray(2.0))
+    np.testing.assert_allclose(
+        dae.outputs(0.0, z, jnp.asarray(2.0))[0], [2.0, 0.0, 2.0], atol=1e-15
+    )
+
+
+def test_combinations_of_a_circuit():
+    """The transistor amplifier of the test set as it is written, three combinations."""
+    dae = mj.reduce_dae(models.transistor, jnp.array([0.0, 3, 3, 6, 3, 3, 6, 0]))
+    assert (dae.report.index, dae.report.degrees_of_freedom, dae.report.num_constraints) == (
+        1,
+        5,
+        3,
+    )
+
+
+def refused_only_here(t, x, xdot, a):
+    """Cancels for `a = 1`, not for other parameters."""
+    return jnp.stack([a * (xdot[0] - xdot[1]) + x[0], xdot[1] - xdot[0] + x[1]])
+
+
+def refused_as_it_varies(t, x, xdot, a):
+    """The coefficient that cancels is a function of the state."""
+    into = jnp.exp(x[0]) * (xdot[0] - xdot[1])
+    return jnp.stack([into + x[0], -into + x[1]])
+
+
+@pytest.mark.parametrize("F", [refused_only_here, refused_as_it_varies])
+def test_other_cancellations_are_refused(F):
+    with pytest.raises(ValueError, match=r"`F\[0\]`, `F\[1\]` depend on each other"):
+        mj.reduce_dae(F, jnp.ones(2), jnp.asarray(1.0))
+
+
+# Unknowns that are higher derivatives than any in the other equations
+
+
+def test_outputs_beyond_the_leading_derivatives():
+    """A prescribed motion, its speed, acceleration and jerk, by name: nothing but outputs."""
+
+    def motion(t, x, xdot, a):
+        position, speed, acceleration, jerk = x
+        rates = xdot[:3] - jnp.stack([speed, acceleration, 2 * jerk])
+        return jnp.concatenate([rates, (position - jnp.sin(a * t))[None]])
+
+    dae = mj.reduce_dae(motion, jnp.ones(4), jnp.asarray(1.0))
+    t, a = 0.7, jnp.asarray(1.5)
+    z, _ = dae.consistent_state(t, jnp.zeros(4), a)
+    x, rates = jax.jit(dae.outputs)(t, z, a)
+    s, c = np.sin(1.5 * t), np.cos(1.5 * t)
+    np.testing.assert_allclose(x, [s, 1.5 * c, -(1.5**2) * s, -(1.5**3) * c / 2], rtol=1e-14)
+    np.testing.assert_allclose(rates[3], 1.5**4 * s / 2, rtol=1e-14)
+
+
+# Equations of index 1 for Rosenbrock methods
+
+
+def solve(dae, z0, args, **options):
+    control = dfx.PIDController(rtol=1e-9, atol=1e-9)
+    solver = mj.Rodas5P()
+    if dae.report.num_constraints > 0:
+        solver = mj.Projected(solver, dae.constraint)
+    return mj.diffeqsolve(
+        *(dae.terms, solver, 0.0, 1.0, None, z0, args),
+        **dict(stepsize_controller=control, **options),
+    ).ys[-1]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("model", "guess", "args", "states"),
+    [
+        ("diode", jnp.array([0.3, 0.2, 0.0]), models.DIODE_ARGS, 4),
+        ("pendulum", jnp.array([1.3, 0.5, 0.6, -0.3, 0.0]), models.PENDULUM_ARGS, 7),
+    ],
+)
+def test_index_one(model, guess, args, states):
+    args = jax.tree.map(jnp.asarray, args)
+    ends = {}
+    for form in ("ode", "index-1"):
+        dae = mj.reduce_dae(getattr(models, model), guess, args, form=form)
+
+        def end(args, dae=dae):
+            z0, _ = dae.consistent_state(0.0, guess, args)
+            return dae.outputs(1.0, solve(dae, z0, args), args)[0]
+
+        ends[form] = jax.jit(jax.value_and_grad(lambda args, end=end: end(args)[0]))(args)
+    assert isinstance(dae.terms, mj.MassMatrixTerm)
+    assert len(dae.report.states) == states
+    assert dae.report.lifted == ()
+    np.testing.assert_allclose(ends["ode"][0], ends["index-1"][0], rtol=1e-8)
+    for name, gradient in ends["ode"][1].items():
+        np.testing.assert_allclose(gradient, ends["index-1"][1][name], rtol=1e-6, atol=1e-9)
+
+
+def test_index_one_on_the_manifold():
+    args = jax.tree.map(jnp.asarray, models.PENDULUM_ARGS)
+    guess = jnp.array([1.3, 0.5, 0.6, -0.3, 0.0])
+    dae = mj.reduce_dae(models.pendulum, guess, args, form="index-1")
+    z0, info = dae.consistent_state(0.0, guess, args)
+    assert info.success
+    x, xdot = dae.outputs(0.0, z0, args)
+    np.testing.assert_allclose(models.pendulum(0.0, x, xdot, args), 0, atol=1e-13)
+    z = solve(dae, z0, args)
+    assert mj.constraint_violation(dae.constraint, 1.0, z, args) < 1e-14
+
+
+def test_forms():
+    with pytest.raises(ValueError, match="`form` must be 'ode' or 'index-1', got 'index-3'"):
+        mj.reduce_dae(models.rlc_series, jnp.ones(4), models.RLC_ARGS, form="index-3")
+
+
+def test_equations_that_need_their_multiplier():
+    """Friction of the size of the multiplier: not defined for one of zero, which the equation of
+    the state does not have."""
+
+    def sliding(t, x, xdot, a):
+        q, v, force = x["q"], x["v"], x["force"]
+        size = jnp.sqrt(force**2)
+        drag = a * size * v / jnp.sqrt(v @ v)
+        normal = jnp.array([0.0, 1.0])
+        motion = xdot["v"] - jnp.array([1.0, -9.81]) - force * normal + drag
+        return {"kinematics": xdot["q"] - v, "motion": motion, "floor": q[1]}
+
+    start = {"q": jnp.array([0.0, 0.0]), "v": jnp.array([1.0, 0.0]), "force": jnp.asarray(9.0)}
+    a = jnp.asarray(0.2)
+    dae = mj.reduce_dae(sliding, start, a, form="index-1")
+    y, info = dae.consistent_state(0.0, start, a)
+    assert info.success
+    np.testing.assert_allclose(dae.outputs(0.0, y, a)[0]["force"], 9.81, rtol=1e-12)
+    _, xdot = dae.outputs(0.0, y, a)
+    np.testing.assert_allclose(xdot["v"][0], 1 - 0.2 * 9.81, rtol=1e-12)
