@@ -17,6 +17,8 @@ FILES = sorted(PACKAGE.rglob("*.py"))
 LAYERS = [
     {"_custom_types", "_compat", "_errors", "_user_function", "_rejection"},
     {"_linear", "_residual", "_projection", "_stability", "_directed_term", "_scalar"},
+    {"_incidence"},
+    {"_sparse"},
     {"_newton"},
     {"_correction"},
     {"_projection_info"},

@@ -16,6 +16,7 @@ from .._linear import multiply
 from .._projection import NewtonProjection
 from .._projection_info import ProjectionInfo
 from .._residual import as_time
+from .._sparse import Choice
 from .correction import InverseMetrics, TwoStages
 from .kinematics import Kinematics
 
@@ -42,6 +43,7 @@ class MechanicalConstraint(AbstractConstraint):
     nonholonomic: Callable | None
     mass_matrix: Callable  # (t, q, v, args)
     redundant: bool = eqx.field(static=True)
+    structure: Choice = eqx.field(static=True, default="dense")
 
     def __call__(self, t: RealScalarLike, y: Y, args: Args = None) -> Any:
         equations = Kinematics.of(self, y)
@@ -55,11 +57,12 @@ class MechanicalConstraint(AbstractConstraint):
         fallback = y if fallback is None else fallback
         x, _ = jfu.ravel_pytree(y)
         stages = self._stages(projection, t, y, args, directions)
+        stages = stages if directions is None else stages.dense()
         corrected, roots = stages.correct(y, fallback, far)
         return corrected, ProjectionInfo.of_correction(x, *roots)
 
     def normals(self, projection, t, y, args=None) -> Normals:
-        stages = self._stages(projection, t, y, args, None)
+        stages = self._stages(projection, t, y, args, None).dense()
         return stages.normals(*stages.equations.flat(y)).normals
 
     def push_forward(self, t, y, args, directions, vector) -> Y:
@@ -68,7 +71,7 @@ class MechanicalConstraint(AbstractConstraint):
         x, w = equations.flat(y)
         e_x, e_w = equations.flat(vector)
         t = as_time(t, x.dtype)
-        C, p = equations.rows(t, x, w, args)
+        C, p = equations.dense().rows(t, x, w, args)
         if p > 0:
             positions = Normals(C[:p], directions[:p])
             e_x = without_normal_part(positions, e_x, multiply(C[:p], e_x), self.redundant)

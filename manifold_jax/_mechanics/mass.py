@@ -11,7 +11,8 @@ import jax.tree_util as jtu
 from jaxtyping import Array, Float
 
 from .._custom_types import Args, BoolScalar, RealScalarLike, Y
-from .._linear import Factorization, factorize, gram, UNROLL_LIMIT
+from .._linear import Factorization, factorize, gram, Rows, UNROLL_LIMIT
+from .._sparse import SparseRows
 
 
 class ConfigurationMass(eqx.Module):
@@ -59,6 +60,20 @@ class Mass(eqx.Module):
         return self.factorization.solve(rows.T).T
 
 
+class InverseWeights(eqx.Module):
+    """A diagonal metric, given by its inverse."""
+
+    weights: Float[Array, " n"]
+
+    def solve(self, rows: Float[Array, "*k n"]) -> Float[Array, "*k n"]:
+        return rows * jnp.broadcast_to(self.weights, rows.shape)
+
+
+def directions_of(metric: "Mass | InverseWeights", C: Rows) -> Rows:
+    """The rows of `V^T = C W^-1`."""
+    return C.along(metric) if isinstance(C, SparseRows) else metric.solve(C)
+
+
 def mass_values(mass_matrix: Any, q: Y) -> Float[Array, "..."]:
     """What `mass_matrix` returned as a scalar, a diagonal `(n,)` or a matrix `(n, n)`."""
     x, _ = jfu.ravel_pytree(q)
@@ -80,7 +95,7 @@ def mass_values(mass_matrix: Any, q: Y) -> Float[Array, "..."]:
     )
 
 
-def factorize_mass(M: Float[Array, "..."], C: Float[Array, "m n"]) -> Mass:
+def factorize_mass(M: Float[Array, "..."], C: Rows) -> Mass:
     """Factor `M`, of one of the forms of `mass_values`, under constraints `C a = b`.
 
     A singular matrix is allowed if it is positive definite on the null space of `C`, that is

@@ -8,10 +8,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._custom_types import Args, RealScalarLike, Y
-from .._linear import combine, factorize, gram, gram_written_out, multiply
+from .._linear import AbstractRows, combine, factorize, gram, gram_written_out, multiply
 from .further import split
 from .kinematics import check_mechanical_state, Kinematics
-from .mass import Mass
+from .mass import directions_of, Mass
 
 
 class Motion:
@@ -29,9 +29,13 @@ class Motion:
         self.bias = self.equations.acceleration_bias(self.t, self.x, self.w, args)
         self.force = _flat_force(system.force(t, q, v, *further, args), q, self.x)
         self.mass: Mass = self.equations.mass(self.t, self.x, self.w, args, self.C)
-        self.directions = self.mass.solve(self.C)
+        self.directions = directions_of(self.mass, self.C)
         self.redundant = system.redundant
-        self.factorization = factorize(gram_written_out(self.C, self.directions), system.redundant)
+        if isinstance(self.C, AbstractRows):
+            self.factorization = self.C.factorize(self.directions)
+        else:
+            gram_matrix = gram_written_out(self.C, self.directions)
+            self.factorization = factorize(gram_matrix, system.redundant)
 
     def solve(self, bias: Float[Array, " m"]) -> tuple[Float[Array, " n"], Float[Array, " m"]]:
         """Accelerations and multipliers of `M a + C^T lambda = Q`, `C a = -bias`."""
@@ -52,10 +56,13 @@ class Motion:
     def stabilized_velocity(self) -> Float[Array, " n"]:
         p = self.num_positions
         rate = self.equations.velocity(self.t, self.w, (self.x, self.args))[:p]
-        J, directions = self.C[:p], self.directions[:p]
-        return self.w - combine(
-            factorize(gram(J, directions), self.redundant).solve(rate), directions
-        )
+        J = self.equations.position_rows(self.t, self.x, self.w, self.args, self.C, p)
+        directions = directions_of(self.mass, J)
+        if isinstance(J, AbstractRows):
+            factorization = J.factorize(directions)
+        else:
+            factorization = factorize(gram(J, directions), self.redundant)
+        return self.w - combine(factorization.solve(rate), directions)
 
 
 def _flat_force(force: Any, q: Y, x: Float[Array, " n"]) -> Float[Array, " n"]:

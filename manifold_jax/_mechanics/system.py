@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 from .._constraint import AbstractConstraint
 from .._custom_types import Args, RealScalarLike, Y
 from .._directed_term import DirectedTerm
+from .._sparse import Choice
 from .._user_function import check_function
 from .constraint import MechanicalConstraint
 from .further import check_further_rates, ExtendedConstraint
@@ -80,6 +81,7 @@ class MechanicalSystem(eqx.Module):
     further_constraint: AbstractConstraint | None
     stabilization: Baumgarte | VelocityStabilization | None
     redundant: bool = eqx.field(static=True)
+    structure: Choice = eqx.field(static=True)
 
     def __init__(
         self,
@@ -92,9 +94,11 @@ class MechanicalSystem(eqx.Module):
         further_constraint: AbstractConstraint | None = None,
         stabilization: Baumgarte | VelocityStabilization | None = None,
         redundant: bool = False,
+        structure: Choice = "auto",
     ):
         _check_arguments(constraint, force, velocity_constraint, stabilization, further)
         _check_further(further, further_constraint)
+        _check_structure(structure, redundant)
         own = isinstance(mass_matrix, LagrangianMass | ConfigurationMass)  # of another system
         if callable(mass_matrix) and not own:
             check_function("mass_matrix", mass_matrix, "M(q, args)")
@@ -106,6 +110,7 @@ class MechanicalSystem(eqx.Module):
         self.further_constraint = further_constraint
         self.stabilization = stabilization
         self.redundant = redundant
+        self.structure = structure
 
     @classmethod
     def from_lagrangian(
@@ -139,7 +144,7 @@ class MechanicalSystem(eqx.Module):
     def constraint(self) -> MechanicalConstraint | ExtendedConstraint:
         """The manifold, for [`Projected`][], [`Stabilized`][] and [`LocalCoordinates`][]."""
         motion = MechanicalConstraint(
-            self.holonomic, self.nonholonomic, self.mass_matrix, self.redundant
+            self.holonomic, self.nonholonomic, self.mass_matrix, self.redundant, self.structure
         )
         return (
             motion if self.further is None else ExtendedConstraint(motion, self.further_constraint)
@@ -213,6 +218,16 @@ def _check_arguments(
         raise TypeError(
             "`stabilization` must be `mj.Baumgarte(alpha, beta)` or `mj.VelocityStabilization()`, got "
             f"{type(stabilization).__name__}. Others are arguments of `mj.Stabilized`."
+        )
+
+
+def _check_structure(structure: Any, redundant: bool) -> None:
+    if structure not in ("auto", "dense", "sparse"):
+        raise ValueError(f"`structure` must be 'auto', 'dense' or 'sparse', got {structure!r}.")
+    if structure == "sparse" and redundant:
+        raise ValueError(
+            "`structure='sparse'` needs independent constraints, as its elimination cannot tell which depend on others. "
+            "Remove the dependent ones, or use `structure='dense'` with `redundant=True`."
         )
 
 
