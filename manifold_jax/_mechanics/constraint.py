@@ -12,11 +12,11 @@ from jaxtyping import Array, Float
 from .._constraint import AbstractConstraint
 from .._correction import Normals, without_normal_part
 from .._custom_types import Args, BoolScalar, RealScalarLike, Y
-from .._linear import multiply
+from .._linear import AbstractRows, multiply
 from .._projection import NewtonProjection
 from .._projection_info import ProjectionInfo
 from .._residual import as_time
-from .._sparse import Choice
+from .._sparse import Choice, SparseRows, structure_of
 from .correction import InverseMetrics, TwoStages
 from .kinematics import Kinematics
 
@@ -64,6 +64,16 @@ class MechanicalConstraint(AbstractConstraint):
     def normals(self, projection, t, y, args=None) -> Normals:
         stages = self._stages(projection, t, y, args, None).dense()
         return stages.normals(*stages.equations.flat(y)).normals
+
+    def sparse_rows(self, t, y, args=None) -> AbstractRows | None:
+        equations = Kinematics.of(self, y)
+        x, w = equations.flat(y)
+        t = as_time(t, x.dtype)
+        if equations.structure_at(t, x, w, args) is None:
+            return None
+        state = jnp.concatenate([x, w])
+        structure = structure_of(((lambda state: equations.both(t, state, args), state),))
+        return None if structure is None else SparseRows.of(equations.both, t, state, args, structure)
 
     def push_forward(self, t, y, args, directions, vector) -> Y:
         """Positions first; the velocities depend on them."""

@@ -6,4 +6,5 @@ from .structure import (
     Choice as Choice,
     choose_structure as choose_structure,
     Structure as Structure,
+    structure_of as structure_of,
 )

@@ -102,8 +102,8 @@ def _solves(product: Any, blocks: Blocks, eliminated: Any, structure: Structure)
     if structure.place is not None:
         diagonal = diagonal[_places(structure)]
     size = jnp.sqrt(jnp.where(diagonal > 0, diagonal, 1))
-    numbers = jnp.arange(structure.num_equations, dtype=size.dtype)
-    known = jnp.cos(numbers * numbers)
+    mixed = jnp.arange(structure.num_equations, dtype=jnp.uint32) * jnp.uint32(2654435769)
+    known = jnp.where(mixed >> 31 == 0, 1, -1).astype(size.dtype)  # signs without a pattern
     error = _in_order(structure, eliminated, product(known / size)) * size - known
     return jnp.max(jnp.abs(error)) <= float(jnp.finfo(size.dtype).eps) ** _DIGITS
 

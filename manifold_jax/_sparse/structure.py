@@ -62,7 +62,7 @@ def choose_structure(
     m = sum(jax.eval_shape(function, x).size for function, x in equations)
     if choice == "auto" and (m < _SMALLEST or per_block > n * _WIDEST):
         return None
-    structure = _structure_of(equations, per_block)
+    structure = structure_of(equations, per_block)
     if choice == "auto":
         return None if structure is None or structure.width > m * _WIDEST else structure
     if structure is None or (m > _SMALLEST and 3 * structure.width > m):
@@ -87,8 +87,9 @@ _FOUND: dict[Any, Structure | None] = {}
 _MOST_FOUND = 64
 
 
-def _structure_of(equations: Any, per_block: int) -> Structure | None:
-    """Found once for each traced program, which is evaluated in many places."""
+def structure_of(equations: Any, per_block: int = 1) -> Structure | None:
+    """As for `choose_structure`, if there is any. Found once for each traced program, which is
+    evaluated in many places."""
     key = per_block, *(_program(function, x) for function, x in equations)
     if key not in _FOUND:
         patterns = [dependence(function, x) for function, x in equations]

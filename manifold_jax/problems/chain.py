@@ -36,7 +36,7 @@ def _points(links: Float[Array, "N 2"]) -> Float[Array, " n"]:
 
 def _mass(q: Float[Array, " n"], args: ChainArgs) -> Float[Array, " n"]:
     del q
-    return jnp.repeat(args.masses, 2)
+    return jnp.broadcast_to(args.masses[:, None], (*args.masses.shape, 2)).reshape(-1)
 
 
 def _rods(t: RealScalarLike, q: Float[Array, " n"], args: ChainArgs) -> Float[Array, " N"]:
