@@ -41,8 +41,9 @@ class AbstractRows(eqx.Module):
         """`max_j |C_ij| scale_j` with positive scales."""
 
     @abc.abstractmethod
-    def factorize(self, directions: "AbstractRows") -> Any:
-        """`C V` with the rows of `V^T`, factored: `solve(b)`, and `full_rank`."""
+    def factorize(self, directions: "AbstractRows", checked: bool = True) -> Any:
+        """`C V` with the rows of `V^T`, factored: `solve(b)`, and `full_rank`. That is not known if
+        it is not checked; then look at the residuals of solutions, `solves(residual, size)`."""
 
     @abc.abstractmethod
     def of_other(self, function: Any, t: Array, x: Float[Array, " n"], args: Any) -> "AbstractRows":

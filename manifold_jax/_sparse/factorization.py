@@ -1,5 +1,6 @@
 """`G V` of sparse rows, formed from products, and factored."""
 
+import dataclasses
 from typing import Any
 
 import equinox as eqx
@@ -7,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._custom_types import BoolScalar
+from .._custom_types import BoolScalar, FloatScalar
 from .._linear import AbstractRows
 from .elimination import Blocks, eliminate
 from .structure import Structure
@@ -29,15 +30,18 @@ class BlockFactorization(eqx.Module):
     full_rank: BoolScalar
 
     @staticmethod
-    def of(rows, directions, structure: Structure, symmetric: bool) -> "BlockFactorization":
+    def of(
+        rows, directions, structure: Structure, symmetric: bool, checked: bool
+    ) -> "BlockFactorization":
         fixed_rows, fixed_directions = _fixed(rows), _fixed(directions)
         product = lambda z: fixed_rows.multiply(fixed_directions.combine(z))
         blocks = _blocks(product, structure, fixed_rows.x.dtype)
-        eliminated = eliminate(blocks)
-        full_rank = _solves(product, blocks, eliminated, structure)
-        return BlockFactorization(
-            rows, directions, blocks, eliminated, structure, symmetric, full_rank
+        factorization = BlockFactorization(
+            rows, directions, blocks, eliminate(blocks), structure, symmetric, jnp.asarray(True)
         )
+        if not checked:
+            return factorization
+        return dataclasses.replace(factorization, full_rank=factorization._is_right(product))
 
     def solve(self, b: Float[Array, " m"]) -> Float[Array, " m"]:
         structure = self.structure
@@ -49,6 +53,38 @@ class BlockFactorization(eqx.Module):
             solve,
             solve if self.symmetric else transposed,
         )
+
+
+    def solves(self, residual: Float[Array, " m"], size: FloatScalar) -> BoolScalar:
+        """Whether a residual is small beside typical right-hand sides of the equations, each
+        divided by the length of its gradient, of that `size`."""
+        error = jnp.max(jnp.abs(jax.lax.stop_gradient(residual)) / self.lengths)
+        return error <= _tolerance(residual.dtype) * jax.lax.stop_gradient(size)
+
+    @property
+    def lengths(self) -> Float[Array, " m"]:
+        """Of the gradients, in the metric of the directions."""
+        structure = self.structure
+        diagonal = jnp.diagonal(self.blocks.diagonal, axis1=1, axis2=2).reshape(-1)
+        diagonal = diagonal[: structure.num_equations]
+        if structure.place is not None:
+            diagonal = diagonal[_places(structure)]
+        return jnp.sqrt(jnp.where(diagonal > 0, diagonal, 1))
+
+    def _is_right(self, product: Any) -> BoolScalar:
+        """Of a system with a known solution: equations of any units."""
+        lengths = self.lengths
+        mixed = jnp.arange(lengths.size, dtype=jnp.uint32) * jnp.uint32(2654435769)
+        known = jnp.where(mixed >> 31 == 0, 1, -1).astype(lengths.dtype)  # signs without a pattern
+        solution = _in_order(self.structure, self.eliminated, product(known / lengths))
+        error = jnp.max(jnp.abs(solution * lengths - known))
+        return error <= _tolerance(lengths.dtype)
+
+
+def _tolerance(dtype: Any) -> float:
+    """A solution of a system without full rank is off by as much as its size. Long chains are ill
+    conditioned, so that little can be asked for in single precision: 2e-3 (7e-2)."""
+    return float(jnp.finfo(dtype).eps) ** (1 / 6)
 
 
 def _fixed(rows: Any) -> Any:
@@ -93,21 +129,3 @@ def _in_order(structure: Structure, eliminated: Any, b: Float[Array, " m"]) -> F
     padded = jnp.pad(_ordered(structure, b), (0, structure.num_blocks * width - m))
     z = eliminated.solve(padded.reshape(-1, width)).reshape(-1)[:m]
     return z if structure.place is None else z[_places(structure)]
-
-
-def _solves(product: Any, blocks: Blocks, eliminated: Any, structure: Structure) -> BoolScalar:
-    """Equations of any units: scaled by the diagonal."""
-    diagonal = jnp.diagonal(blocks.diagonal, axis1=1, axis2=2).reshape(-1)
-    diagonal = diagonal[: structure.num_equations]
-    if structure.place is not None:
-        diagonal = diagonal[_places(structure)]
-    size = jnp.sqrt(jnp.where(diagonal > 0, diagonal, 1))
-    mixed = jnp.arange(structure.num_equations, dtype=jnp.uint32) * jnp.uint32(2654435769)
-    known = jnp.where(mixed >> 31 == 0, 1, -1).astype(size.dtype)  # signs without a pattern
-    error = _in_order(structure, eliminated, product(known / size)) * size - known
-    return jnp.max(jnp.abs(error)) <= float(jnp.finfo(size.dtype).eps) ** _DIGITS
-
-
-# A solution of a system without full rank is off by as much as its size. Long chains are ill
-# conditioned, so that little can be asked for in single precision: 2e-3 (7e-2).
-_DIGITS = 1 / 6

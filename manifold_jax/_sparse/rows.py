@@ -60,9 +60,9 @@ class SparseRows(AbstractRows):
         entries = jax.vmap(self.multiply)(jnp.where(seeds, scale[None, :], 0))
         return jnp.max(jnp.abs(entries), axis=0)
 
-    def factorize(self, directions: "SparseRows") -> BlockFactorization:
+    def factorize(self, directions: "SparseRows", checked: bool = True) -> BlockFactorization:
         symmetric = directions.function is self.function and directions.x is self.x
-        return BlockFactorization.of(self, directions, self.structure, symmetric)
+        return BlockFactorization.of(self, directions, self.structure, symmetric, checked)
 
     def _values(self, x: Float[Array, " n"]) -> Any:
         return self.function(self.t, x, self.args)
