@@ -50,7 +50,7 @@ class AbstractRows(eqx.Module):
         """Those of `function(t, x, args)` at `x`, of the same structure."""
 
 
-Rows: TypeAlias = Float[Array, "m n"] | AbstractRows
+Rows: TypeAlias = Float[Array, "_ _"] | AbstractRows
 
 
 class Factorization(eqx.Module):

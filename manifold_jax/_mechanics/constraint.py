@@ -15,7 +15,7 @@ from .._custom_types import Args, BoolScalar, RealScalarLike, Y
 from .._linear import AbstractRows, multiply
 from .._projection import NewtonProjection
 from .._projection_info import ProjectionInfo
-from .._residual import as_time
+from .._residual import as_time, residual_vector
 from .._sparse import Choice, SparseRows, structure_of
 from .correction import InverseMetrics, TwoStages
 from .kinematics import Kinematics
@@ -66,14 +66,13 @@ class MechanicalConstraint(AbstractConstraint):
         return stages.normals(*stages.equations.flat(y)).normals
 
     def sparse_rows(self, t, y, args=None) -> AbstractRows | None:
+        return rows_of(self, t, y, args) if self.is_sparse(t, y, args) else None
+
+    def is_sparse(self, t: RealScalarLike, y: Y, args: Args) -> bool:
+        """Whether Jacobians are not held as arrays. Known while tracing."""
         equations = Kinematics.of(self, y)
         x, w = equations.flat(y)
-        t = as_time(t, x.dtype)
-        if equations.structure_at(t, x, w, args) is None:
-            return None
-        state = jnp.concatenate([x, w])
-        structure = structure_of(((lambda state: equations.both(t, state, args), state),))
-        return None if structure is None else SparseRows.of(equations.both, t, state, args, structure)
+        return equations.structure_at(as_time(t, x.dtype), x, w, args) is not None
 
     def push_forward(self, t, y, args, directions, vector) -> Y:
         """Positions first; the velocities depend on them."""
@@ -109,3 +108,14 @@ class MechanicalConstraint(AbstractConstraint):
         metrics = InverseMetrics.of(projection, y)
         t = as_time(t, jnp.result_type(*jax.tree_util.tree_leaves(y)))
         return TwoStages(equations, t, args, projection, metrics, directions, self.redundant)
+
+
+def rows_of(
+    constraint: AbstractConstraint, t: RealScalarLike, y: Y, args: Args
+) -> SparseRows | None:
+    """Those of all equations with respect to the whole state, if they are sparse, too."""
+    x, unravel = jfu.ravel_pytree(y)
+    t = as_time(t, x.dtype)
+    residual = lambda t, x, args: residual_vector(constraint, t, unravel(x), args)
+    structure = structure_of(((lambda x: residual(t, x, args), x),))
+    return None if structure is None else SparseRows.of(residual, t, x, args, structure)

@@ -66,11 +66,6 @@ class Kinematics(NamedTuple):
         extra = self.nonholonomic(t, self.unravel(x), self.unravel(w), args)
         return jnp.concatenate([rate, jfu.ravel_pytree(extra)[0]])
 
-    def both(self, t: Array, xw: Float[Array, " 2k"], args: Args) -> Float[Array, " pm"]:
-        """The residuals of positions and of velocities."""
-        x, w = jnp.split(xw, 2)
-        return jnp.concatenate([self.position(t, x, args), self.velocity(t, w, (x, args))])
-
     def rows(
         self, t: Array, x: Float[Array, " k"], w: Float[Array, " k"], args: Args
     ) -> tuple[Rows, int]:

@@ -93,7 +93,7 @@ class InChunks(eqx.Module):
 
     @staticmethod
     def of(blocks: Blocks) -> "InChunks":
-        number, width, _ = blocks.diagonal.shape
+        _, width, _ = blocks.diagonal.shape
         eye = jnp.eye(width, dtype=blocks.diagonal.dtype)
         L, D, U = (
             _chunks(A, fill) for A, fill in zip(blocks, (0 * eye, eye, 0 * eye), strict=True)
@@ -191,7 +191,7 @@ def _times(A: Float[Array, "*b w w"], B: Float[Array, "*b w w"]) -> Float[Array,
     return sum(A[..., :, k, None] * B[..., None, k, :] for k in range(width))
 
 
-def _apply(A: Float[Array, "*b w w"], x: Float[Array, "*b w"]) -> Float[Array, "*b w"]:
+def _apply(A: Float[Array, "*b w w"], x: Float[Array, "*c w"]) -> Float[Array, "*b w"]:
     width = A.shape[-1]
     if width > _WRITTEN_OUT:
         return jnp.einsum("...ij,...j->...i", A, x)

@@ -54,7 +54,6 @@ class BlockFactorization(eqx.Module):
             solve if self.symmetric else transposed,
         )
 
-
     def solves(self, residual: Float[Array, " m"], size: FloatScalar) -> BoolScalar:
         """Whether a residual is small beside typical right-hand sides of the equations, each
         divided by the length of its gradient, of that `size`."""

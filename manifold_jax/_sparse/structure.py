@@ -57,30 +57,33 @@ def choose_structure(
     whose numbers have the masses."""
     if choice == "dense":
         return None
-    n = equations[0][1].size
-    per_block = {2: n, 3: mass_shape[-1]}.get(len(mass_shape), 1)
+    if len(mass_shape) == 2:
+        if choice == "sparse":
+            raise ValueError(_FULL_MASS.format(shape=mass_shape))
+        return None
+    per_block = mass_shape[-1] if len(mass_shape) == 3 else 1
     m = sum(jax.eval_shape(function, x).size for function, x in equations)
-    if choice == "auto" and (m < _SMALLEST or per_block > n * _WIDEST):
+    if choice == "auto" and m < _SMALLEST:
         return None
     structure = structure_of(equations, per_block)
     if choice == "auto":
         return None if structure is None or structure.width > m * _WIDEST else structure
     if structure is None or (m > _SMALLEST and 3 * structure.width > m):
-        raise ValueError(_not_sparse(structure, m, n, per_block))
+        found = "most of them depend on most coordinates"
+        if structure is not None:
+            found = f"reordered, they are coupled in blocks of {structure.width}"
+        raise ValueError(_NOT_SPARSE.format(m=m, found=found))
     return structure
 
 
-def _not_sparse(structure: Structure | None, m: int, n: int, per_block: int) -> str:
-    found = "most equations depend on most coordinates" if structure is None else ""
-    if structure is not None and per_block == n:
-        found = f"`mass_matrix` is a full matrix of shape ({n}, {n})"
-    elif structure is not None:
-        found = f"after reordering, its {m} equations are coupled in blocks of {structure.width}"
-    return (
-        f"`structure='sparse'`: {found}. Use `structure='dense'`, or write equations that depend on few neighbours: "
-        "masses as diagonals or blocks of shape (bodies, d, d), indices as NumPy arrays that the function closes "
-        "over, not in `args`, no cumulative sums."
-    )
+_FULL_MASS = (
+    "`structure='sparse'`, but `mass_matrix` is a full matrix of shape {shape}. Return a diagonal, or the blocks on the "
+    "diagonal, one per body, as an array of shape (bodies, d, d); or use `structure='dense'`."
+)
+_NOT_SPARSE = (
+    "`structure='sparse'`, but the {m} constraints are not: {found}. Use `structure='dense'`, or write equations of few "
+    "neighbours each: no cumulative sums, and indices as NumPy arrays that the function closes over, not in `args`."
+)
 
 
 _FOUND: dict[Any, Structure | None] = {}
