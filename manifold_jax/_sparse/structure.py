@@ -35,12 +35,20 @@ class Structure:
 
     def __init__(self, depends: sp.csr_matrix, per_block: int):
         self.num_equations, self.num_unknowns = depends.shape
+        self._depends = depends
         blocks = _merged(depends, per_block)
         coupled = (blocks @ blocks.T).tocoo()
         self.order, self.width = _best_order(coupled)
         self.place = None if self.order is None else np.argsort(self.order).astype(np.int32)
-        self.color, self.num_colors = _colored(depends)
         self.local = np.diff(blocks.indptr) == 1
+
+    @functools.cached_property
+    def color(self) -> np.ndarray:
+        return _colored(self._depends)
+
+    @property
+    def num_colors(self) -> int:
+        return int(self.color.max(initial=0)) + 1
 
     @property
     def num_blocks(self) -> int:
@@ -145,7 +153,7 @@ def _width(coupled: sp.coo_matrix, place: np.ndarray) -> int:
     return next(width for width in range((band + 1) // 2, band + 1) if fits(width))
 
 
-def _colored(depends: sp.csr_matrix) -> tuple[np.ndarray, int]:
+def _colored(depends: sp.csr_matrix) -> np.ndarray:
     """Greedily (Curtis, Powell & Reid, J. Inst. Maths Applics 13 (1974) 117-119)."""
     by_column = depends.tocsc()
     taken: list[set[int]] = [set() for _ in range(depends.shape[0])]
@@ -157,4 +165,4 @@ def _colored(depends: sp.csr_matrix) -> tuple[np.ndarray, int]:
         colors[j] = color
         for i in rows:
             taken[i].add(color)
-    return colors, int(colors.max(initial=0)) + 1
+    return colors
