@@ -229,7 +229,7 @@ def write_figure(path: Path, rows: list[dict[str, Any]]) -> None:
     for axes, title in ((left, "ms per step"), (right, "temporary memory, MB")):
         axes.set(xlabel="links", title=title)
         axes.grid(alpha=0.3)
-        axes.legend(loc="lower right")
+        axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.18), ncols=3, fontsize=8)
     figure.savefig(path, dpi=150)
 
 
