@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 
 from ._correction import equations_of, Normals, solve_correction, without_normal_part
 from ._custom_types import Args, BoolScalar, RealScalarLike, Residual, ResidualFunction, Y
-from ._linear import multiply
+from ._linear import AbstractRows, multiply
 from ._projection import NewtonProjection
 from ._projection_info import ProjectionInfo
 from ._user_function import check_function
@@ -90,6 +90,11 @@ class AbstractConstraint(eqx.Module):
         """What leads across the manifold at `y`: `G = dg/dy` and the rows of `V^T = G W^-1`, both
         `(m, k)`. `k` is `n`, unless components are moved together (positions and velocities)."""
         return equations_of(self, t, y, args, projection, self.redundant).normals()
+
+    def sparse_rows(self, t: RealScalarLike, y: Y, args: Args = None) -> AbstractRows | None:
+        """`G = dg/dy` at `y` without its entries, if there are many equations of few unknowns."""
+        del t, y, args
+        return None
 
     def push_forward(
         self, t: RealScalarLike, y: Y, args: Args, directions: Float[Array, "m k"], vector: Y

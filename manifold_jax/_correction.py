@@ -15,13 +15,12 @@ from jaxtyping import Array, Float
 
 from ._custom_types import Args, BoolScalar, FloatScalar, IntScalar, RealScalarLike, Y
 from ._linear import (
+    AbstractRows,
     combine,
-    Factorization,
     factorize_once,
     gram,
-    Inverse,
     pseudo_invert,
-    PseudoInverse,
+    Rows,
 )
 from ._newton import AbstractEquations, chord, damped_newton, implicit_tangent
 from ._projection import NewtonProjection
@@ -33,19 +32,21 @@ class Normals(NamedTuple):
     `V^T`, along which points nearby are corrected, by default `V = W^-1 G^T`. Both `(m, k)` for
     `k` components that are moved together, by default the `n` of the state."""
 
-    jacobian: Float[Array, "m k"]
-    directions: Float[Array, "m k"]
+    jacobian: Rows
+    directions: Rows
 
 
 class Crossing(NamedTuple):
     """The normals at a point with `G V` factored: the linearization of a correction."""
 
     normals: Normals
-    factorization: Factorization | Inverse | PseudoInverse
+    factorization: Any  # Factorization | Inverse | PseudoInverse, or that of sparse rows
 
     @staticmethod
     def of(normals: Normals, redundant: bool, dependent: FloatScalar | float = 1e-4) -> "Crossing":
         """`dependent` as in `pseudo_invert`, for `redundant` equations."""
+        if isinstance(normals.jacobian, AbstractRows):
+            return Crossing(normals, normals.jacobian.factorize(normals.directions))
         A = gram(*normals)
         if not redundant:
             return Crossing(normals, factorize_once(A))
@@ -67,7 +68,7 @@ class CorrectionEquations(AbstractEquations):
     x: Float[Array, " n"]
     args: Args
     inverse_metric: Float[Array, " n"] | None = None
-    directions: Float[Array, "m n"] | None = None
+    directions: Rows | None = None
     redundant: bool = eqx.field(static=True, default=False)
 
     def residual(self, x: Float[Array, " n"]) -> Float[Array, " m"]:
@@ -82,6 +83,9 @@ class CorrectionEquations(AbstractEquations):
         return self.x + (d if self.inverse_metric is None else self.inverse_metric * d)
 
     def linearize(self, x: Float[Array, " n"]) -> Crossing:
+        if isinstance(self.directions, AbstractRows):
+            rows = self.directions.of_other(self.function, self.t, x, self.args)
+            return Crossing.of(Normals(rows, self.directions), self.redundant)
         G = jacobian(self.residual, x)[1]
         if self.directions is not None:
             return Crossing.of(Normals(G, self.directions), self.redundant)
@@ -112,7 +116,7 @@ class CorrectionEquations(AbstractEquations):
     def starting_at(self, x: Float[Array, " n"]) -> "CorrectionEquations":
         return dataclasses.replace(self, x=x)
 
-    def along(self, directions: Float[Array, "m n"]) -> "CorrectionEquations":
+    def along(self, directions: Rows) -> "CorrectionEquations":
         return dataclasses.replace(self, directions=directions)
 
 

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ._custom_types import Args, RealScalarLike, ResidualFunction, Y
+from ._linear import AbstractRows, Rows
 
 
 def residual_vector(
@@ -28,7 +29,7 @@ def jacobian(
     return r, rows
 
 
-def row_scale(G: Float[Array, "m n"], x: Float[Array, " n"]) -> Float[Array, " m"]:
+def row_scale(G: Rows, x: Float[Array, " n"]) -> Float[Array, " m"]:
     """Typical size of each residual, `max_j |G_ij| (|x_j| + 1)`.
 
     This is row equilibration (Sudarsan & Keerthi 1998, eqs. (3.3)-(3.4), with the typical
@@ -38,8 +39,11 @@ def row_scale(G: Float[Array, "m n"], x: Float[Array, " n"]) -> Float[Array, " m
     a third of the points beside a rod of length 1, given as displacements of 1e-3, could not be
     corrected: the residual has rounding errors of 1e-16 whatever the displacements.
     """
-    scale = jnp.max(jnp.abs(G) * (jnp.abs(x) + 1)[None, :], axis=1)
-    return jnp.maximum(scale, jnp.finfo(G.dtype).tiny)
+    if isinstance(G, AbstractRows):
+        scale = G.sizes(jnp.abs(x) + 1)
+    else:
+        scale = jnp.max(jnp.abs(G) * (jnp.abs(x) + 1)[None, :], axis=1)
+    return jnp.maximum(scale, jnp.finfo(scale.dtype).tiny)
 
 
 def as_time(t: RealScalarLike, dtype: Any) -> Array:

@@ -58,5 +58,7 @@ def constraint_violation(
 def _violation(constraint: AbstractConstraint, t: Array, y: Y, args: Args) -> FloatScalar:
     check_constraint(constraint, t, y, args)
     x, unravel = jfu.ravel_pytree(y)
-    r, G = jacobian(lambda x: residual_vector(constraint, t, unravel(x), args), x)
+    residual = lambda x: residual_vector(constraint, t, unravel(x), args)
+    rows = constraint.sparse_rows(t, y, args)
+    r, G = jacobian(residual, x) if rows is None else (residual(x), rows)
     return jnp.max(jnp.abs(r) / row_scale(G, x))

@@ -25,6 +25,8 @@ LAYERS = [
         "_rejection",
     },
     {"_linear", "_residual", "_projection", "_stability", "_directed_term", "_scalar"},
+    {"_incidence"},
+    {"_sparse"},
     {"_newton"},
     {"_correction"},
     {"_projection_info"},

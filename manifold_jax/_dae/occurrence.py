@@ -9,8 +9,8 @@ import numpy as np
 from jaxtyping import Array
 
 from .._custom_types import Args
+from .._incidence import incidence
 from .equations import Equations
-from .incidence import incidence
 from .picking import pick
 
 

@@ -12,10 +12,11 @@ from jaxtyping import Array, Float
 from .._constraint import AbstractConstraint
 from .._correction import Normals, without_normal_part
 from .._custom_types import Args, BoolScalar, RealScalarLike, Y
-from .._linear import multiply
+from .._linear import AbstractRows, multiply
 from .._projection import NewtonProjection
 from .._projection_info import ProjectionInfo
-from .._residual import as_time
+from .._residual import as_time, residual_vector
+from .._sparse import Choice, SparseRows, structure_of
 from .correction import InverseMetrics, TwoStages
 from .kinematics import Kinematics
 
@@ -42,6 +43,7 @@ class MechanicalConstraint(AbstractConstraint):
     nonholonomic: Callable | None
     mass_matrix: Callable  # (t, q, v, args)
     redundant: bool = eqx.field(static=True)
+    structure: Choice = eqx.field(static=True, default="dense")
 
     def __call__(self, t: RealScalarLike, y: Y, args: Args = None) -> Any:
         equations = Kinematics.of(self, y)
@@ -55,12 +57,22 @@ class MechanicalConstraint(AbstractConstraint):
         fallback = y if fallback is None else fallback
         x, _ = jfu.ravel_pytree(y)
         stages = self._stages(projection, t, y, args, directions)
+        stages = stages if directions is None else stages.dense()
         corrected, roots = stages.correct(y, fallback, far)
         return corrected, ProjectionInfo.of_correction(x, *roots)
 
     def normals(self, projection, t, y, args=None) -> Normals:
-        stages = self._stages(projection, t, y, args, None)
+        stages = self._stages(projection, t, y, args, None).dense()
         return stages.normals(*stages.equations.flat(y)).normals
+
+    def sparse_rows(self, t, y, args=None) -> AbstractRows | None:
+        return rows_of(self, t, y, args) if self.is_sparse(t, y, args) else None
+
+    def is_sparse(self, t: RealScalarLike, y: Y, args: Args) -> bool:
+        """Whether Jacobians are not held as arrays. Known while tracing."""
+        equations = Kinematics.of(self, y)
+        x, w = equations.flat(y)
+        return equations.structure_at(as_time(t, x.dtype), x, w, args) is not None
 
     def push_forward(self, t, y, args, directions, vector) -> Y:
         """Positions first; the velocities depend on them."""
@@ -68,7 +80,7 @@ class MechanicalConstraint(AbstractConstraint):
         x, w = equations.flat(y)
         e_x, e_w = equations.flat(vector)
         t = as_time(t, x.dtype)
-        C, p = equations.rows(t, x, w, args)
+        C, p = equations.dense().rows(t, x, w, args)
         if p > 0:
             positions = Normals(C[:p], directions[:p])
             e_x = without_normal_part(positions, e_x, multiply(C[:p], e_x), self.redundant)
@@ -96,3 +108,14 @@ class MechanicalConstraint(AbstractConstraint):
         metrics = InverseMetrics.of(projection, y)
         t = as_time(t, jnp.result_type(*jax.tree_util.tree_leaves(y)))
         return TwoStages(equations, t, args, projection, metrics, directions, self.redundant)
+
+
+def rows_of(
+    constraint: AbstractConstraint, t: RealScalarLike, y: Y, args: Args
+) -> SparseRows | None:
+    """Those of all equations with respect to the whole state, if they are sparse, too."""
+    x, unravel = jfu.ravel_pytree(y)
+    t = as_time(t, x.dtype)
+    residual = lambda t, x, args: residual_vector(constraint, t, unravel(x), args)
+    structure = structure_of(((lambda x: residual(t, x, args), x),))
+    return None if structure is None else SparseRows.of(residual, t, x, args, structure)

@@ -21,7 +21,9 @@ from jaxtyping import Array, Float
 from .._correction import CorrectionEquations, CorrectionRoot, Crossing, Normals, solve_correction
 from .._custom_types import Args, BoolScalar, Y
 from .._projection import NewtonProjection
+from .._sparse import SparseRows
 from .kinematics import Kinematics
+from .mass import directions_of, InverseWeights
 
 
 class InverseMetrics(NamedTuple):
@@ -53,6 +55,9 @@ class TwoStages(NamedTuple):
     directions: Float[Array, "m k"] | None
     redundant: bool
 
+    def dense(self) -> "TwoStages":
+        return self._replace(equations=self.equations.dense())
+
     def correct(
         self, y: Y, fallback: Y, far: bool
     ) -> tuple[Y, tuple[CorrectionRoot, CorrectionRoot]]:
@@ -81,10 +86,10 @@ class TwoStages(NamedTuple):
         C, p = self.equations.rows(self.t, x, w, self.args)
         directions, valid = self.directions, jnp.asarray(True)
         if directions is None and self.metrics is not None:
-            directions = C * self.metrics.velocities[None, :]
+            directions = directions_of(InverseWeights(self.metrics.velocities), C)
         elif directions is None:
             mass = self.equations.mass(self.t, x, w, self.args, C)
-            directions, valid = mass.solve(C), mass.valid
+            directions, valid = directions_of(mass, C), mass.valid
         return MechanicalNormals(Normals(C, directions), p, valid)
 
     def _crossing(self, x: Float[Array, " k"], w: Float[Array, " k"]) -> tuple[Crossing, int]:
@@ -97,13 +102,20 @@ class TwoStages(NamedTuple):
     def _positions(self, x, safe, crossing: Crossing, p: int, far: bool) -> CorrectionRoot:
         if p == 0:
             return _nothing_to_do(x)
-        (C, directions), _ = crossing
-        if self.metrics is not None:  # one for positions of its own
-            directions = directions * (self.metrics.positions / self.metrics.velocities)[None, :]
-        if p < C.shape[0] or self.metrics is not None:
-            crossing = Crossing.of(Normals(C[:p], directions[:p]), self.redundant)
+        if self.equations.nonholonomic is not None or self.metrics is not None:
+            normals = self._position_normals(x, crossing.normals, p)
+            crossing = Crossing.of(normals, self.redundant)
         residual = eqx.filter_closure_convert(self.equations.position, self.t, x, self.args)
         return self._solve(residual, x, self.args, safe, crossing, far)
+
+    def _position_normals(self, x, normals: Normals, p: int) -> Normals:
+        (C, directions), metrics = normals, self.metrics
+        J = self.equations.position_rows(self.t, x, x, self.args, C, p)
+        if metrics is not None:  # one for positions of its own
+            return Normals(J, directions_of(InverseWeights(metrics.positions), J))
+        if isinstance(J, SparseRows):
+            return Normals(J, J.along(directions.metric))
+        return Normals(J, directions[:p])
 
     def _velocities(self, x, w, safe, crossing: Crossing, far: bool) -> CorrectionRoot:
         context = (x, self.args)

@@ -10,9 +10,10 @@ from jaxtyping import Array, Float
 from .._constraint import AbstractConstraint
 from .._correction import Normals
 from .._custom_types import Args, RealScalarLike, Y
+from .._linear import AbstractRows
 from .._projection import NewtonProjection
 from .._projection_info import ProjectionInfo
-from .constraint import MechanicalConstraint
+from .constraint import MechanicalConstraint, rows_of
 
 
 class ExtendedConstraint(AbstractConstraint):
@@ -51,6 +52,9 @@ class ExtendedConstraint(AbstractConstraint):
 
     def normals(self, projection, t, y, args=None) -> Normals:
         return self.motion.normals(_projections(projection, y)[0], t, split(y)[0], args)
+
+    def sparse_rows(self, t, y, args=None) -> AbstractRows | None:
+        return rows_of(self, t, y, args) if self.motion.is_sparse(t, split(y)[0], args) else None
 
     def push_forward(self, t, y, args, directions: Float[Array, "m k"], vector) -> Y:
         (motion, z), (e, e_z) = split(y), split(vector)

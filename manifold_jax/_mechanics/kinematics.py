@@ -10,7 +10,9 @@ import jax.tree_util as jtu
 from jaxtyping import Array, Float
 
 from .._custom_types import Args, Y
+from .._linear import AbstractRows, Rows
 from .._residual import jacobian
+from .._sparse import Choice, choose_structure, SparseRows, Structure
 from .mass import factorize_mass, Mass, mass_values
 
 
@@ -22,13 +24,26 @@ class Kinematics(NamedTuple):
     nonholonomic: Callable | None
     mass_matrix: Callable
     unravel: Callable
+    structure: Choice
+    redundant: bool
 
     @staticmethod
     def of(system: Any, y: Y) -> "Kinematics":
         """Of a mechanical system, or of its constraint, for states like `y`."""
         q, _ = check_mechanical_state(y)
         unravel = jfu.ravel_pytree(q)[1]
-        return Kinematics(system.holonomic, system.nonholonomic, system.mass_matrix, unravel)
+        return Kinematics(
+            system.holonomic,
+            system.nonholonomic,
+            system.mass_matrix,
+            unravel,
+            system.structure,
+            system.redundant,
+        )
+
+    def dense(self) -> "Kinematics":
+        """The same, with Jacobians as arrays."""
+        return self._replace(structure="dense")
 
     def flat(self, y: Y) -> tuple[Float[Array, " k"], Float[Array, " k"]]:
         q, v = y
@@ -53,13 +68,42 @@ class Kinematics(NamedTuple):
 
     def rows(
         self, t: Array, x: Float[Array, " k"], w: Float[Array, " k"], args: Args
-    ) -> tuple[Float[Array, "m k"], int]:
+    ) -> tuple[Rows, int]:
         """`C = [J; da/dv]`, and how many of the rows belong to positions."""
+        if (structure := self.structure_at(t, x, w, args)) is not None:
+            p = jax.eval_shape(self.position, t, x, args).size
+            if self.nonholonomic is None:
+                return SparseRows.of(self.position, t, x, args, structure), p
+            return SparseRows.of(self.velocity, t, w, (x, args), structure), p
         _, J = jacobian(lambda x: self.position(t, x, args), x)
         if self.nonholonomic is None:
             return J, J.shape[0]
         nonholonomic = lambda w: self.velocity(t, w, (x, args))[J.shape[0] :]
         return jnp.concatenate([J, jacobian(nonholonomic, w)[1]]), J.shape[0]
+
+    def position_rows(
+        self, t: Array, x: Float[Array, " k"], w: Float[Array, " k"], args: Args, C: Rows, p: int
+    ) -> Rows:
+        """`J`, the first `p` of the rows `C`."""
+        if isinstance(C, AbstractRows):
+            of_positions = self._replace(nonholonomic=None)
+            return of_positions.rows(t, x, w, args)[0]
+        return C[:p]
+
+    def structure_at(
+        self, t: Array, x: Float[Array, " k"], w: Float[Array, " k"], args: Args
+    ) -> Structure | None:
+        """Of the rows, if they are sparse. Known while tracing."""
+        if self.structure == "dense" or self.redundant:
+            return None
+        equations = []
+        if self.holonomic is not None:
+            equations.append((lambda x: self.position(t, x, args), x))
+        if self.nonholonomic is not None:
+            extra = lambda w: self.nonholonomic(t, self.unravel(x), self.unravel(w), args)
+            equations.append((lambda w: jfu.ravel_pytree(extra(w))[0], w))
+        mass = jax.eval_shape(lambda: self.mass_values(t, x, w, args))
+        return choose_structure(self.structure, tuple(equations), mass.shape)
 
     def acceleration_bias(
         self, t: Array, x: Float[Array, " k"], w: Float[Array, " k"], args: Args
@@ -74,11 +118,15 @@ class Kinematics(NamedTuple):
         x: Float[Array, " k"],
         w: Float[Array, " k"],
         args: Args,
-        C: Float[Array, "m k"],
+        C: Rows,
     ) -> Mass:
+        return factorize_mass(self.mass_values(t, x, w, args), C)
+
+    def mass_values(
+        self, t: Array, x: Float[Array, " k"], w: Float[Array, " k"], args: Args
+    ) -> Float[Array, "..."]:
         q, v = self.unravel(x), self.unravel(w)
-        values = mass_values(self.mass_matrix(t, q, v, args), q)
-        return factorize_mass(values, C)
+        return mass_values(self.mass_matrix(t, q, v, args), q)
 
 
 def check_mechanical_state(y: Y) -> tuple[Any, Any]:

@@ -1,4 +1,4 @@
-"""The mass matrix in its three forms (scalar, diagonal, matrix), factored once per evaluation."""
+"""The mass matrix in its forms (scalar, diagonal, blocks, matrix), factored once per evaluation."""
 
 from collections.abc import Callable
 from typing import Any
@@ -11,7 +11,8 @@ import jax.tree_util as jtu
 from jaxtyping import Array, Float
 
 from .._custom_types import Args, BoolScalar, RealScalarLike, Y
-from .._linear import Factorization, factorize, gram, UNROLL_LIMIT
+from .._linear import Factorization, factorize, gram, Rows, UNROLL_LIMIT
+from .._sparse import SparseRows
 
 
 class ConfigurationMass(eqx.Module):
@@ -36,8 +37,8 @@ class LagrangianMass(eqx.Module):
 class Mass(eqx.Module):
     """A factored mass matrix.
 
-    - `diagonal`: scalar or `(n,)`; `None` for a full matrix.
-    - `factorization`: of the full matrix, to which `C^T D C` has been added.
+    - `diagonal`: scalar or `(n,)`; `None` for a matrix.
+    - `factorization`: of the matrix, to which `C^T D C` has been added; of blocks one each.
     - `augmentation`: the diagonal of `D`, shape `(m,)`, or `None` for a diagonal.
     - `symmetric`, `positive`: whether the matrix can be used.
     """
@@ -55,14 +56,36 @@ class Mass(eqx.Module):
     def solve(self, rows: Float[Array, "*k n"]) -> Float[Array, "*k n"]:
         """`M^-1` applied to each row."""
         if self.factorization is None:
-            return rows / jnp.broadcast_to(self.diagonal, rows.shape)  # pyright: ignore[reportArgumentType]
-        return self.factorization.solve(rows.T).T
+            return rows / jnp.broadcast_to(self.diagonal, rows.shape)
+        if self.factorization.full_rank.ndim == 0:
+            return self.factorization.solve(rows.T).T
+        number, size = self.factorization.A.shape[:2]
+        parts = jnp.moveaxis(rows.reshape(*rows.shape[:-1], number, size), -2, 0)
+        solved = jax.vmap(lambda block, r: block.solve(r.T).T)(self.factorization, parts)
+        return jnp.moveaxis(solved, 0, -2).reshape(rows.shape)
+
+
+class InverseWeights(eqx.Module):
+    """A diagonal metric, given by its inverse."""
+
+    weights: Float[Array, " n"]
+
+    def solve(self, rows: Float[Array, "*k n"]) -> Float[Array, "*k n"]:
+        return rows * jnp.broadcast_to(self.weights, rows.shape)
+
+
+def directions_of(metric: "Mass | InverseWeights", C: Rows) -> Rows:
+    """The rows of `V^T = C W^-1`."""
+    return C.along(metric) if isinstance(C, SparseRows) else metric.solve(C)
 
 
 def mass_values(mass_matrix: Any, q: Y) -> Float[Array, "..."]:
-    """What `mass_matrix` returned as a scalar, a diagonal `(n,)` or a matrix `(n, n)`."""
+    """What `mass_matrix` returned as a scalar, a diagonal `(n,)`, a matrix `(n, n)` or its blocks
+    `(n / d, d, d)`."""
     x, _ = jfu.ravel_pytree(q)
     n = x.size
+    if eqx.is_array_like(mass_matrix) and _is_blocks(jnp.shape(mass_matrix), n):
+        return jnp.asarray(mass_matrix, x.dtype)
     if eqx.is_array_like(mass_matrix) and jnp.shape(mass_matrix) in ((), (n,), (n, n)):
         return jnp.asarray(mass_matrix, x.dtype)
     shapes = jtu.tree_map(jnp.shape, mass_matrix)
@@ -74,13 +97,13 @@ def mass_values(mass_matrix: Any, q: Y) -> Float[Array, "..."]:
             spread = lambda M, leaf: jnp.broadcast_to(jnp.asarray(M, leaf.dtype), leaf.shape)
             return jfu.ravel_pytree(jtu.tree_map(spread, mass_matrix, q))[0]
     raise ValueError(
-        f"`mass_matrix` must be a scalar, a diagonal of shape ({n},) or of the shapes of q, or a matrix of shape ({n}, "
-        f"{n}) for q of {n} numbers of shapes {jtu.tree_map(jnp.shape, q)}, got {shapes}. Masses of points whose "
+        f"`mass_matrix` must be a scalar, a diagonal of shape ({n},) or of the shapes of q, a matrix of shape ({n}, "
+        f"{n}), or the blocks on its diagonal, of shape (bodies, d, d), for q of {n} numbers of shapes {jtu.tree_map(jnp.shape, q)}, got {shapes}. Masses of points whose "
         "positions are the rows of q: `jnp.broadcast_to(masses[:, None], q.shape)`."
     )
 
 
-def factorize_mass(M: Float[Array, "..."], C: Float[Array, "m n"]) -> Mass:
+def factorize_mass(M: Float[Array, "..."], C: Rows) -> Mass:
     """Factor `M`, of one of the forms of `mass_values`, under constraints `C a = b`.
 
     A singular matrix is allowed if it is positive definite on the null space of `C`, that is
@@ -93,6 +116,8 @@ def factorize_mass(M: Float[Array, "..."], C: Float[Array, "m n"]) -> Mass:
     if M.ndim < 2:
         positive = jnp.all(M > 0)
         return Mass(jnp.where(positive, M, 1), None, None, yes, positive)
+    if M.ndim == 3:
+        return _factorize_blocks(M, C)
     asymmetry = jnp.max(jnp.abs(M - M.T))
     symmetric = asymmetry <= 100 * jnp.finfo(M.dtype).eps * jnp.max(jnp.abs(M))
     weights = jax.lax.stop_gradient(_weights(M, C))
@@ -100,15 +125,54 @@ def factorize_mass(M: Float[Array, "..."], C: Float[Array, "m n"]) -> Mass:
     return Mass(None, factorization, weights, symmetric, factorization.full_rank)
 
 
+def _is_blocks(shape: tuple[int, ...], n: int) -> bool:
+    return len(shape) == 3 and shape[1] == shape[2] and shape[0] * shape[1] == n
+
+
+def _factorize_blocks(M: Float[Array, "b d d"], C: Rows) -> Mass:
+    """Each of the blocks, under the constraints that concern its coordinates alone (the unit length
+    of a quaternion): a block may be singular in the directions that those exclude."""
+    if not isinstance(C, SparseRows):
+        return factorize_mass(jax.scipy.linalg.block_diag(*M), C)
+    asymmetry = jnp.max(jnp.abs(M - jnp.swapaxes(M, 1, 2)))
+    symmetric = asymmetry <= 100 * jnp.finfo(M.dtype).eps * jnp.max(jnp.abs(M))
+    augmentation = jnp.zeros((C.structure.num_equations,), M.dtype)
+    if C.structure.local.any():
+        M, augmentation = _augmented(M, C)
+    factorization = jax.vmap(_factorize_positive)(M)
+    return Mass(None, factorization, augmentation, symmetric, jnp.all(factorization.full_rank))
+
+
+def _augmented(
+    M: Float[Array, "b d d"], C: SparseRows
+) -> tuple[Float[Array, "b d d"], Float[Array, " m"]]:
+    """`M + C^T D C` with the diagonal `D` of `_weights` for local constraints, zero for others."""
+    number, size, _ = M.shape
+    masses = jax.vmap(_masses)(M).reshape(-1)
+    seeds = jnp.tile(jnp.eye(size, dtype=M.dtype), (1, number))  # one coordinate of all blocks
+    local = jnp.asarray(C.structure.local)[None, :]
+    entries = jnp.where(local, jax.vmap(C.multiply)(seeds), 0)
+    lighter = jax.vmap(C.multiply)(seeds / jax.lax.stop_gradient(masses)[None, :])
+    lengths = jax.lax.stop_gradient(jnp.sum(entries * lighter, axis=0))
+    tiny = jnp.finfo(M.dtype).tiny
+    weights = jnp.where(local[0], 1 / jnp.maximum(lengths, tiny), 0)
+    columns = jax.vmap(C.combine)(weights[None, :] * entries)
+    return M + jnp.moveaxis(columns.reshape(size, number, size), 0, 2), weights
+
+
 def _weights(M: Float[Array, "n n"], C: Float[Array, "m n"]) -> Float[Array, " m"]:
     """The diagonal of `D`, `1 / (C diag(M)^-1 C^T)_ii`: then no entry of `C_i^T D_i C_i` exceeds
     `sqrt(M_jj M_kk)`, and light bodies keep their digits beside heavy ones. Diagonal entries that
     are zero to rounding count as the mean."""
+    size = jnp.sum(C * C / _masses(M)[None, :], axis=1)
+    return 1 / jnp.maximum(size, jnp.finfo(M.dtype).tiny)
+
+
+def _masses(M: Float[Array, "n n"]) -> Float[Array, " n"]:
+    """The diagonal, with the mean in the place of zeros."""
     diagonal = jnp.diagonal(M)
     mean, eps = jnp.mean(jnp.abs(diagonal)), jnp.finfo(M.dtype).eps
-    masses = jnp.where(diagonal > 10 * eps * mean, diagonal, mean)
-    size = jnp.sum(C * C / masses[None, :], axis=1)
-    return 1 / jnp.maximum(size, jnp.finfo(M.dtype).tiny)
+    return jnp.where(diagonal > 10 * eps * mean, diagonal, mean)
 
 
 def _factorize_positive(M: Float[Array, "n n"]) -> Factorization:

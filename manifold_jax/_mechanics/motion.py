@@ -7,11 +7,11 @@ import jax.flatten_util as jfu
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._custom_types import Args, RealScalarLike, Y
-from .._linear import combine, factorize, gram, gram_written_out, multiply
+from .._custom_types import Args, BoolScalar, RealScalarLike, Y
+from .._linear import AbstractRows, combine, factorize, gram, gram_written_out, multiply
 from .further import split
 from .kinematics import check_mechanical_state, Kinematics
-from .mass import Mass
+from .mass import directions_of, Mass
 
 
 class Motion:
@@ -29,9 +29,13 @@ class Motion:
         self.bias = self.equations.acceleration_bias(self.t, self.x, self.w, args)
         self.force = _flat_force(system.force(t, q, v, *further, args), q, self.x)
         self.mass: Mass = self.equations.mass(self.t, self.x, self.w, args, self.C)
-        self.directions = self.mass.solve(self.C)
+        self.directions = directions_of(self.mass, self.C)
         self.redundant = system.redundant
-        self.factorization = factorize(gram_written_out(self.C, self.directions), system.redundant)
+        if isinstance(self.C, AbstractRows):
+            self.factorization = self.C.factorize(self.directions, checked=False)
+        else:
+            gram_matrix = gram_written_out(self.C, self.directions)
+            self.factorization = factorize(gram_matrix, system.redundant)
 
     def solve(self, bias: Float[Array, " m"]) -> tuple[Float[Array, " n"], Float[Array, " m"]]:
         """Accelerations and multipliers of `M a + C^T lambda = Q`, `C a = -bias`."""
@@ -40,10 +44,21 @@ class Motion:
             force = force - combine(self.mass.augmentation * bias, self.C)
         free = self.mass.solve(force)
         multipliers = self.factorization.solve(multiply(self.C, free) + bias)
+        accelerations = free - combine(multipliers, self.directions)
         # Added, not selected: the derivative of a discarded NaN would be NaN.
         valid = self.mass.valid & self.factorization.full_rank
+        if isinstance(self.C, AbstractRows):
+            valid &= self._satisfied(accelerations, free, force, bias)
         undefined = jnp.where(valid, 0, jnp.nan).astype(free.dtype)
-        return free - combine(multipliers, self.directions) + undefined, multipliers + undefined
+        return accelerations + undefined, multipliers + undefined
+
+    def _satisfied(self, accelerations, free, force, bias) -> BoolScalar:
+        """Whether `C a = -bias`, for factorizations of which the rank is not known: a missing entry
+        or dependent equations show in that, unless their accelerations are right nevertheless."""
+        rates = jnp.max(jnp.abs(bias) / self.factorization.lengths)
+        size = rates + jnp.sqrt(jnp.max(jnp.abs(free * force)))  # as `M free = force`
+        residual = multiply(self.C, accelerations) + bias
+        return self.factorization.solves(residual, size)
 
     def constrained(self, b: Float[Array, " m"]) -> Float[Array, " n"]:
         """The smallest change of the velocities, in the metric of the masses, with `C dv = b`."""
@@ -52,10 +67,13 @@ class Motion:
     def stabilized_velocity(self) -> Float[Array, " n"]:
         p = self.num_positions
         rate = self.equations.velocity(self.t, self.w, (self.x, self.args))[:p]
-        J, directions = self.C[:p], self.directions[:p]
-        return self.w - combine(
-            factorize(gram(J, directions), self.redundant).solve(rate), directions
-        )
+        J = self.equations.position_rows(self.t, self.x, self.w, self.args, self.C, p)
+        directions = directions_of(self.mass, J)
+        if isinstance(J, AbstractRows):
+            factorization = J.factorize(directions)
+        else:
+            factorization = factorize(gram(J, directions), self.redundant)
+        return self.w - combine(factorization.solve(rate), directions)
 
 
 def _flat_force(force: Any, q: Y, x: Float[Array, " n"]) -> Float[Array, " n"]:

@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 from .._constraint import AbstractConstraint
 from .._custom_types import Args, RealScalarLike, Y
 from .._directed_term import DirectedTerm
+from .._sparse import Choice
 from .._user_function import check_function
 from .constraint import MechanicalConstraint
 from .further import check_further_rates, ExtendedConstraint
@@ -43,9 +44,9 @@ class MechanicalSystem(eqx.Module):
     **Arguments:**
 
     - `mass_matrix`: `M(q, args)` or a constant: a scalar, a diagonal of shape `(n,)` or of the
-        structure and shapes of `q`, or a symmetric matrix `(n, n)` in the order of
-        `ravel_pytree(q)`. A matrix may be singular as long as no motion that the constraints allow
-        is without mass (quaternions).
+        structure and shapes of `q`, or in the order of `ravel_pytree(q)` a symmetric matrix
+        `(n, n)` or the blocks on its diagonal, `(bodies, d, d)` with `n = bodies * d`. A matrix may
+        be singular as long as no motion that the constraints allow is without mass (quaternions).
     - `constraint`: `phi(t, q, args)`, any pytree of real arrays; time-dependent (rheonomic)
         constraints are allowed. `None` if there are only constraints on velocities.
     - `force`: `Q(t, q, v, args)`, like `q`: applied forces and, for configuration-dependent
@@ -64,6 +65,16 @@ class MechanicalSystem(eqx.Module):
         dependent is decided anew in every evaluation, also beside the manifold: directions in
         which the equations are a hundred times weaker than in the strongest. Write equations
         in like units, and keep tolerances below about 1e-3.
+    - `structure`: `"sparse"` for many constraints of few coordinates each (chains, trusses,
+        molecules), at a cost that grows with their number `m`, not with `m^3`: `J M^-1 J^T`, reordered
+        by reverse Cuthill-McKee, is eliminated in blocks of its bandwidth `w`, `m w^2` operations; all
+        else are products with `J`, which is never formed. `"dense"` for matrices. `"auto"` takes
+        sparse ones for 32 constraints or more if blocks are at most a sixth of that. Which constraint
+        depends on which coordinates is found from the function itself, whatever the values: indices
+        must be NumPy arrays that it closes over, not be in `args`. Sparse masses are scalars, diagonals
+        or blocks, a block may be singular only in directions that constraints on its own coordinates
+        exclude, and constraints may not depend on each other. [`LocalCoordinates`][] and
+        [`Stabilized`][] form dense matrices whatever the structure.
 
     Where the accelerations are not defined (a mass matrix that is not positive definite or not
     symmetric, dependent constraints) they are NaN: steps that meet them are rejected and the
@@ -80,6 +91,7 @@ class MechanicalSystem(eqx.Module):
     further_constraint: AbstractConstraint | None
     stabilization: Baumgarte | VelocityStabilization | None
     redundant: bool = eqx.field(static=True)
+    structure: Choice = eqx.field(static=True)
 
     def __init__(
         self,
@@ -92,9 +104,11 @@ class MechanicalSystem(eqx.Module):
         further_constraint: AbstractConstraint | None = None,
         stabilization: Baumgarte | VelocityStabilization | None = None,
         redundant: bool = False,
+        structure: Choice = "auto",
     ):
         _check_arguments(constraint, force, velocity_constraint, stabilization, further)
         _check_further(further, further_constraint)
+        _check_structure(structure, redundant)
         own = isinstance(mass_matrix, LagrangianMass | ConfigurationMass)  # of another system
         if callable(mass_matrix) and not own:
             check_function("mass_matrix", mass_matrix, "M(q, args)")
@@ -106,6 +120,7 @@ class MechanicalSystem(eqx.Module):
         self.further_constraint = further_constraint
         self.stabilization = stabilization
         self.redundant = redundant
+        self.structure = structure
 
     @classmethod
     def from_lagrangian(
@@ -123,7 +138,7 @@ class MechanicalSystem(eqx.Module):
 
         - `lagrangian`: `L(t, q, v, args)`, a scalar.
         - `constraint`, and by keyword `velocity_constraint`, `stabilization`, `redundant`: as
-            for [`MechanicalSystem`][].
+            for [`MechanicalSystem`][]. The mass matrix is a full one, so that matrices are dense.
         - `force`: forces that have no potential, such as friction; `None` for none.
 
         Masses and gyroscopic terms are second derivatives of `L`; write them out where the
@@ -143,6 +158,7 @@ class MechanicalSystem(eqx.Module):
             nonholonomic=self.nonholonomic,
             mass_matrix=self.mass_matrix,
             redundant=self.redundant,
+            structure=self.structure,
         )
         return (
             motion
@@ -218,6 +234,16 @@ def _check_arguments(
         raise TypeError(
             "`stabilization` must be `mj.Baumgarte(alpha, beta)` or `mj.VelocityStabilization()`, got "
             f"{type(stabilization).__name__}. Others are arguments of `mj.Stabilized`."
+        )
+
+
+def _check_structure(structure: Any, redundant: bool) -> None:
+    if structure not in ("auto", "dense", "sparse"):
+        raise ValueError(f"`structure` must be 'auto', 'dense' or 'sparse', got {structure!r}.")
+    if structure == "sparse" and redundant:
+        raise ValueError(
+            "`structure='sparse'` needs independent constraints, as its elimination cannot tell which depend on others. "
+            "Remove the dependent ones, or use `structure='dense'` with `redundant=True`."
         )
 
 

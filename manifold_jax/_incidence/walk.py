@@ -95,8 +95,8 @@ class Walk(NamedTuple):
             return [Value.constant(value, self.number) for value in known]
         if name.startswith("custom_vjp") and not constant:
             raise TypeError(
-                "`F` uses a function with `jax.custom_vjp`, which cannot be differentiated forwards, as derivatives "
-                "with respect to time are. Write its rule with `jax.custom_jvp`."
+                "The equations use a function with `jax.custom_vjp`, which cannot be differentiated forwards, as "
+                "derivatives with respect to time are. Write its rule with `jax.custom_jvp`."
             )
         if name in _CONTROL:
             return _CONTROL[name](self, equation, values)

@@ -1,0 +1,1 @@
+from .walk import Incidence as Incidence, incidence as incidence

@@ -1,0 +1,10 @@
+"""Jacobians of many rows at linear cost: which entries there are, products without the matrix, and
+the elimination of block tridiagonal matrices."""
+
+from .rows import SparseRows as SparseRows
+from .structure import (
+    Choice as Choice,
+    choose_structure as choose_structure,
+    Structure as Structure,
+    structure_of as structure_of,
+)

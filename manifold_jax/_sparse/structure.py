@@ -1,0 +1,168 @@
+"""The structure of `C M^-1 C^T` for a sparse `C`, found while tracing."""
+
+import functools
+from collections.abc import Callable
+from typing import Any, Literal, TypeAlias
+
+import jax
+import numpy as np
+import scipy.sparse as sp
+from jaxtyping import Array, Float
+from scipy.sparse.csgraph import reverse_cuthill_mckee
+
+from .pattern import dependence
+
+
+Choice: TypeAlias = Literal["auto", "dense", "sparse"]
+
+# Equations from which on, and part of their number up to which blocks may be wide, so that the
+# sparse form is the faster one: `python -m benchmarks.bandwidths`.
+_SMALLEST = 32
+_WIDEST = 1 / 6
+
+
+class Structure:
+    """Of `m` equations in `n` unknowns, of which `per_block` neighbours have masses that are coupled.
+
+    - `order`: of the equations, in which `C M^-1 C^T` is block tridiagonal, and `place` of each of
+        them in it; `None` if it is their own.
+    - `width`: the size of the blocks.
+    - `color`: of each unknown; no equation depends on two of the same color.
+    - `local`: the equations that depend on unknowns of one block of masses only.
+
+    Compared by identity: one that is found again for the same program is the same object.
+    """
+
+    def __init__(self, depends: sp.csr_matrix, per_block: int):
+        self.num_equations, self.num_unknowns = depends.shape
+        self._depends = depends
+        blocks = _merged(depends, per_block)
+        coupled = (blocks @ blocks.T).tocoo()
+        self.order, self.width = _best_order(coupled)
+        self.place = None if self.order is None else np.argsort(self.order).astype(np.int32)
+        self.local = np.diff(blocks.indptr) == 1
+
+    @functools.cached_property
+    def color(self) -> np.ndarray:
+        return _colored(self._depends)
+
+    @property
+    def num_colors(self) -> int:
+        return int(self.color.max(initial=0)) + 1
+
+    @property
+    def num_blocks(self) -> int:
+        """With those that make it a multiple of three, for three colors."""
+        return 3 * -(-self.num_equations // (3 * self.width))
+
+
+def choose_structure(
+    choice: Choice,
+    equations: tuple[tuple[Callable, Float[Array, " n"]], ...],
+    mass_shape: tuple[int, ...],
+) -> Structure | None:
+    """`None` for dense matrices. `equations` are functions of one vector each, of the same length,
+    whose numbers have the masses."""
+    if choice == "dense":
+        return None
+    if len(mass_shape) == 2:
+        if choice == "sparse":
+            raise ValueError(_FULL_MASS.format(shape=mass_shape))
+        return None
+    per_block = mass_shape[-1] if len(mass_shape) == 3 else 1
+    m = sum(jax.eval_shape(function, x).size for function, x in equations)
+    if choice == "auto" and m < _SMALLEST:
+        return None
+    structure = structure_of(equations, per_block)
+    if choice == "auto":
+        return None if structure is None or structure.width > m * _WIDEST else structure
+    if structure is None or (m > _SMALLEST and 3 * structure.width > m):
+        found = "most of them depend on most coordinates"
+        if structure is not None:
+            found = f"reordered, they are coupled in blocks of {structure.width}"
+        raise ValueError(_NOT_SPARSE.format(m=m, found=found))
+    return structure
+
+
+_FULL_MASS = (
+    "`structure='sparse'`, but `mass_matrix` is a full matrix of shape {shape}. Return a diagonal, or the blocks on the "
+    "diagonal, one per body, as an array of shape (bodies, d, d); or use `structure='dense'`."
+)
+_NOT_SPARSE = (
+    "`structure='sparse'`, but the {m} constraints are not: {found}. Use `structure='dense'`, or write equations of few "
+    "neighbours each: no cumulative sums, and indices as NumPy arrays that the function closes over, not in `args`."
+)
+
+
+_FOUND: dict[Any, Structure | None] = {}
+_MOST_FOUND = 64
+
+
+def structure_of(equations: Any, per_block: int = 1) -> Structure | None:
+    """As for `choose_structure`, if there is any. Found once for each traced program, which is
+    evaluated in many places."""
+    key = per_block, *(_program(function, x) for function, x in equations)
+    if key not in _FOUND:
+        patterns = [dependence(function, x) for function, x in equations]
+        structure = None
+        if all(pattern is not None for pattern in patterns):
+            structure = Structure(sp.csr_matrix(sp.vstack(patterns)), per_block)
+        while len(_FOUND) >= _MOST_FOUND:
+            _FOUND.pop(next(iter(_FOUND)))
+        _FOUND[key] = structure
+    return _FOUND[key]
+
+
+def _program(function: Callable, x: Float[Array, " n"]) -> tuple:
+    """The traced function as text, and the constants in it."""
+    closed = jax.make_jaxpr(function)(x)
+    return str(closed.jaxpr), *(_constant(value) for value in closed.consts)
+
+
+def _constant(value: Any) -> Any:
+    if isinstance(value, jax.core.Tracer):
+        return None
+    value = np.asarray(value)
+    return str(value.dtype), value.shape, value.tobytes()
+
+
+def _merged(depends: sp.csr_matrix, per_block: int) -> sp.csr_matrix:
+    """Columns of the same block of masses joined."""
+    if per_block == 1:
+        return depends.astype(np.int64)
+    entries = depends.tocoo()
+    shape = entries.shape[0], -(-entries.shape[1] // per_block)
+    joined = sp.csr_matrix((entries.data, (entries.row, entries.col // per_block)), shape)
+    joined.sum_duplicates()
+    return joined.astype(np.int64)
+
+
+def _best_order(coupled: sp.coo_matrix) -> tuple[np.ndarray | None, int]:
+    """The given order, or that of Cuthill and McKee (Proc. 24th ACM Nat. Conf. (1969) 157-172)."""
+    own = np.arange(coupled.shape[0])
+    order = np.asarray(reverse_cuthill_mckee(coupled.tocsr(), symmetric_mode=True))
+    given, reordered = _width(coupled, own), _width(coupled, np.argsort(order))
+    return (None, given) if given <= reordered else (order, reordered)
+
+
+def _width(coupled: sp.coo_matrix, place: np.ndarray) -> int:
+    """The smallest blocks in which the matrix is block tridiagonal."""
+    i, j = place[coupled.row], place[coupled.col]
+    band = max(1, int(np.abs(i - j).max(initial=1)))
+    fits = lambda width: np.abs(i // width - j // width).max(initial=0) <= 1
+    return next(width for width in range((band + 1) // 2, band + 1) if fits(width))
+
+
+def _colored(depends: sp.csr_matrix) -> np.ndarray:
+    """Greedily (Curtis, Powell & Reid, J. Inst. Maths Applics 13 (1974) 117-119)."""
+    by_column = depends.tocsc()
+    taken: list[set[int]] = [set() for _ in range(depends.shape[0])]
+    colors = np.zeros(depends.shape[1], np.int32)
+    for j in range(depends.shape[1]):
+        rows = by_column.indices[by_column.indptr[j] : by_column.indptr[j + 1]]
+        used = functools.reduce(set.union, [taken[i] for i in rows], set())
+        color = next(color for color in range(len(used) + 1) if color not in used)
+        colors[j] = color
+        for i in rows:
+            taken[i].add(color)
+    return colors
