@@ -10,6 +10,7 @@ from ._multibody import (
     Distance as Distance,
     Fixed as Fixed,
     Force as Force,
+    from_mujoco as from_mujoco,
     GROUND as GROUND,
     JointSpring as JointSpring,
     LinearActuator as LinearActuator,
@@ -21,6 +22,7 @@ from ._multibody import (
     Revolute as Revolute,
     Spherical as Spherical,
     Spring as Spring,
+    state_of_mujoco as state_of_mujoco,
     Torque as Torque,
     Universal as Universal,
 )

@@ -22,4 +22,5 @@ from .joints import (
     Spherical as Spherical,
     Universal as Universal,
 )
+from .mujoco import from_mujoco as from_mujoco, state_of_mujoco as state_of_mujoco
 from .rotations import quaternion as quaternion
