@@ -9,6 +9,7 @@ from collections.abc import Callable
 from ._problem import Problem as Problem
 from .car_axis import car_axis as car_axis
 from .chain import chain as chain, double_pendulum as double_pendulum
+from .delta_robot import delta_robot as delta_robot
 from .four_bar import four_bar as four_bar
 from .heavy_top import heavy_top as heavy_top
 from .kepler import kepler as kepler
@@ -22,6 +23,7 @@ from .rolling_disc import rolling_disc as rolling_disc
 from .slider_crank import slider_crank as slider_crank
 from .small_daes import arevalo as arevalo, jay2 as jay2, skate as skate
 from .spherical_pendulum import spherical_pendulum as spherical_pendulum
+from .stewart_platform import stewart_platform as stewart_platform
 
 
 ALL: dict[str, Callable[[], Problem]] = {
@@ -44,4 +46,6 @@ ALL: dict[str, Callable[[], Problem]] = {
     "spherical-pendulum": spherical_pendulum,
     "heavy-top": heavy_top,
     "rolling-disc": rolling_disc,
+    "delta-robot": delta_robot,
+    "stewart-platform": stewart_platform,
 }
