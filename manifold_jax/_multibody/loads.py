@@ -211,7 +211,9 @@ def _numbers(things: list[Any], names: list[str], *parts: str) -> list[Array]:
 
 def _values(things: list[Any]) -> tuple | None:
     """`None` where nothing is driven."""
-    values = tuple(thing.value if callable(thing.value) else floating(thing.value) for thing in things)
+    values = tuple(
+        thing.value if callable(thing.value) else floating(thing.value) for thing in things
+    )
     driven = any(isinstance(thing, forces.Motor | forces.LinearActuator) for thing in things)
     return values if driven else None
 
@@ -241,9 +243,7 @@ def _on_bodies(bodies: Bodies, groups: Any, things: list, names: list[str], kind
     for thing, name in zip(things, names, strict=True):
         index.append(bodies.index(thing.body, name))
         point = getattr(thing, "point", None)
-        points.append(
-            check_vector(f"{name}: `point`", np.zeros(d) if point is None else point, d)
-        )
+        points.append(check_vector(f"{name}: `point`", np.zeros(d) if point is None else point, d))
     values = tuple(t.value if callable(t.value) else floating(t.value) for t in things)
     return BodyLoads(
         kind == "torque", bodies.planar, tuple(names), tuple(index), in_space(stack(points)), values

@@ -126,9 +126,7 @@ def actuator_fault(mujoco: Any, model: Any, i: int) -> str | None:
         return "actuator gain that is not constant"
     if int(model.actuator_dyntype[i]) != int(mujoco.mjtDyn.mjDYN_NONE):
         return "actuator dynamics"
-    return (
-        None if int(model.actuator_biastype[i]) in biases else "actuator bias that is not affine"
-    )
+    return None if int(model.actuator_biastype[i]) in biases else "actuator bias that is not affine"
 
 
 def equality_fault(mujoco: Any, model: Any, e: int) -> str | None:

@@ -120,8 +120,8 @@ class _Host:
         rate = np.abs(J @ w)
         if not rate.max(initial=0) <= CLOSED * max(1, np.abs(w).max()):
             raise ValueError(
-                f"The velocities do not agree with the joints: {self._worst(rate, 'm/s')}. Give `assemble=True` and "
-                "only those velocities that are known."
+                f"The velocities do not agree with the joints: {self._worst(rate, 'm/s')}. Give only those that are known, "
+                "such that joints allow them, and `assemble=True`."
             )
         if not self.assembly.redundant:
             self._check_rank(J)
@@ -134,7 +134,9 @@ class _Host:
                 if reason
                 else " Give `assemble=True` to close them, or correct positions and orientations."
             )
-            raise ValueError(f"The state does not satisfy the joints: {self._worst(gap, 'm')}.{advice}")
+            raise ValueError(
+                f"The state does not satisfy the joints: {self._worst(gap, 'm')}.{advice}"
+            )
 
     def _worst(self, size: np.ndarray, unit: str) -> str:
         largest = [size[rows].max() for _, rows in self._rows()]
@@ -167,5 +169,3 @@ class _Host:
             f"{', '.join(names[:10])}{', ...' if len(names) > 10 else ''}. If they do so in every pose (closed loops), "
             "write `Assembly(..., redundant=True)`; if in this one alone, start beside it."
         )
-
-

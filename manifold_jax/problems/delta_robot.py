@@ -84,7 +84,10 @@ def _arms(xp: ModuleType, x: Any, u: Any, args: Any) -> tuple[Any, Any, tuple]:
     """Angles of the arms below the horizontal, their rates, and rods `n` with the directions of the
     arms and their derivatives; in NumPy or JAX, for positions of the platform `(..., 3)`."""
     L, directions = args.arm_length, np.array(DIRECTIONS)
-    cosines, sines = xp.asarray(np.cos(directions), L.dtype), xp.asarray(np.sin(directions), L.dtype)
+    cosines, sines = (
+        xp.asarray(np.cos(directions), L.dtype),
+        xp.asarray(np.sin(directions), L.dtype),
+    )
     flat = lambda a: a[..., 0:1] * cosines + a[..., 1:2] * sines  # radial parts
     across = lambda a: a[..., 1:2] * cosines - a[..., 0:1] * sines
     radial = flat(x) + args.platform_radius - args.base_radius  # from the hinges to the wrists

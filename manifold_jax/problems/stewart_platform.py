@@ -172,9 +172,7 @@ def _exact(t: np.ndarray, args: StewartPlatformArgs, y0: Any) -> State:
     spin = 2 * (p[0] * p_rate[1:] - p_rate[0] * p[1:] + np.cross(p[1:], p_rate[1:]))
 
     def field(t, state):
-        return np.concatenate(
-            [state[7:10], _spinning(np, state[3:7], state[10:]), twist(state)]
-        )
+        return np.concatenate([state[7:10], _spinning(np, state[3:7], state[10:]), twist(state)])
 
     states = integrate(field, np.concatenate([x, p, u, spin]), t)
     rows = []
@@ -212,8 +210,7 @@ def _twist_equation(args: StewartPlatformArgs) -> Any:
         linear, angular = velocities(x, R, units[:, :3], units[:, 3:])
         turned = np.cross(w, R.T).T  # w x R, column by column
         bias, turning_bias = (
-            part.imag / tiny
-            for part in velocities(x + 1j * tiny * u, R + 1j * tiny * turned, u, w)
+            part.imag / tiny for part in velocities(x + 1j * tiny * u, R + 1j * tiny * turned, u, w)
         )
         length, frames = _legs(np, base, local @ R.T + x, first_axes)
         n = frames[..., 2]
