@@ -114,7 +114,9 @@ def bricard():
     middles, _ = rod_frames()
     whole = (mb.GROUND, *RODS, mb.GROUND)
     matrices = [R @ np.diag(MOMENTS) @ R.T for R in rod_frames()[1]]
-    bodies = [mb.Body(name, 1.0, I, position=x) for name, I, x in zip(RODS, matrices, middles)]
+    bodies = [
+        mb.Body(name, 1.0, moments, position=x) for name, moments, x in zip(RODS, matrices, middles)
+    ]
     joints = [mb.Revolute(whole[i], whole[i + 1], at=CORNERS[i], axis=AXES[i]) for i in range(6)]
     return mb.Assembly(bodies, joints, gravity=(0.0, -9.81, 0.0), redundant=True)
 

@@ -3,6 +3,8 @@
 What MJCF has to do with it is in `test_multibody_mujoco.py`.
 """
 
+import itertools
+
 import diffrax as dfx
 import equinox as eqx
 import jax
@@ -94,7 +96,7 @@ def test_loops_in_space_whose_equations_depend_on_each_other():
         cases.four_bar_in_space(problem.args, problem.y0).state()
     robot = cases.four_bar_in_space(problem.args, problem.y0, redundant=True)
     flat = cases.four_bar(problem.args)
-    q, v = (np.asarray(part).reshape(3, 3) for part in problem.y0)
+    v = np.asarray(problem.y0[1]).reshape(3, 3)
     upright = lambda p: np.array([p[0], 0.0, p[1]])
     moving = {name: upright(v[i, :2]) for i, name in enumerate(cases.BARS)}
     spins = {name: np.array([0.0, -v[i, 2], 0.0]) for i, name in enumerate(cases.BARS)}
@@ -122,7 +124,7 @@ def every_joint():
         for name in names
     ]
     chain = [mb.GROUND, *names]
-    pairs = list(zip(chain[:-1], chain[1:]))
+    pairs = list(itertools.pairwise(chain))
     at = rng.normal(size=(7, 3))
     first, second = np.linalg.qr(rng.normal(size=(3, 3)))[0][:2]
     axes = rng.normal(size=(3, 3))
@@ -185,7 +187,7 @@ def test_joint_forces_obey_newton_and_euler():
                 if i == len(index):
                     continue
                 # both act at the second point
-                b, body = group.attachment.bodies[1][k], robot.names[group.attachment.bodies[1][k]]
+                body = robot.names[group.attachment.bodies[1][k]]
                 at, _ = robot.point(y, body, group.attachment.points[1][k])
                 arm = np.asarray(at) - np.asarray(q.position[i])
                 F, T = (sign * np.asarray(part) for part in reactions[name])
@@ -230,7 +232,7 @@ def test_energy_of_weight_and_springs_is_kept():
 
     # without dampers and constant forces nothing but weight and springs is left
     loads = tuple(
-        eqx.tree_at(lambda l: l.damping, load, jnp.zeros_like(load.damping))
+        eqx.tree_at(lambda load: load.damping, load, jnp.zeros_like(load.damping))
         for load in robot.loads
         if hasattr(load, "damping")
     )

@@ -144,7 +144,9 @@ class Attachment(eqx.Module):
 
 def attach(bodies: Bodies, things: list[Any], names: list[str], axes: list[Any]) -> Attachment:
     """Points and frames of the drawing in the frames of the bodies."""
-    first, second = zip(*[_indices(bodies, t, name) for t, name in zip(things, names, strict=True)])
+    first, second = zip(
+        *[_indices(bodies, t, name) for t, name in zip(things, names, strict=True)], strict=True
+    )
     frames = Frames.of(bodies.drawing, bodies.drawing)
     pairs = [ends(bodies, t, i, name) for t, i, name in zip(things, first, names, strict=True)]
     is_drawn = jnp.asarray(np.array([pair[0] for pair in pairs])[:, None])

@@ -228,7 +228,9 @@ def _lines(bodies: Bodies, groups: Any, things: list, names: list[str], kind: st
 def _in_joints(
     bodies: Bodies, groups: Any, things: list, names: list[str], kind: str
 ) -> JointLoads:
-    found = [_find_joint(groups, thing.joint, name) for thing, name in zip(things, names)]
+    found = [
+        _find_joint(groups, thing.joint, name) for thing, name in zip(things, names, strict=True)
+    ]
     pick = lambda part, side: stack([getattr(g.attachment, part)[side][i] for g, i in found])
     both: Callable = lambda part: tuple(pick(part, side) for side in (0, 1))
     index = tuple(tuple(g.attachment.bodies[side][i] for g, i in found) for side in (0, 1))
