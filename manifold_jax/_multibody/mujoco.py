@@ -28,6 +28,7 @@ from .mujoco_checks import (
     actuator_fault,
     equality_fault,
     import_mujoco,
+    Index,
     name_of,
     refuse_unsupported,
 )
@@ -127,10 +128,10 @@ class _Tree:
         self.mujoco, self.model, self.drawing = mujoco, model, drawing
         self.joint_of: dict[int, str] = {}  # those with a coordinate, by their index
 
-    def name(self, kind: str, i: int) -> str:
+    def name(self, kind: str, i: Index) -> str:
         return name_of(self.mujoco, self.model, kind, i)
 
-    def body(self, i: int) -> str:
+    def body(self, i: Index) -> str:
         """The name of the body that body `i` is part of."""
         model = self.model
         if model.body_weldid[i] == 0:
@@ -160,7 +161,7 @@ class _Tree:
                 found += self._joint(i)
         return found
 
-    def _joint(self, i: int) -> list[AbstractJoint]:
+    def _joint(self, i: Index) -> list[AbstractJoint]:
         model, drawing, kinds = self.model, self.drawing, self.mujoco.mjtJoint
         start = model.body_jntadr[i]
         own = list(range(start, start + model.body_jntnum[i]))
@@ -200,7 +201,7 @@ class _Tree:
             if not model.eq_active0[e] or equality_fault(self.mujoco, model, e):
                 continue
             name, data = self.name("equality", e), model.eq_data[e]
-            of_sites = model.eq_objtype[e] == int(self.mujoco.mjtObj.mjOBJ_SITE)
+            of_sites = int(model.eq_objtype[e]) == int(self.mujoco.mjtObj.mjOBJ_SITE)
             objects = model.eq_obj1id[e], model.eq_obj2id[e]
             bodies = [model.site_bodyid[i] for i in objects] if of_sites else list(objects)
             if model.eq_type[e] == int(self.mujoco.mjtEq.mjEQ_WELD):
@@ -235,11 +236,11 @@ class _Tree:
             )
         return Fixed(*map(self.body, bodies), at=at, name=name)
 
-    def _in_space(self, body: int, point: np.ndarray) -> np.ndarray:
+    def _in_space(self, body: Index, point: np.ndarray) -> np.ndarray:
         """Of a point in MuJoCo's frame of a body."""
         return self.drawing.xpos[body] + self.drawing.xmat[body].reshape(3, 3) @ point
 
-    def _in_body(self, body: int, point: np.ndarray) -> np.ndarray:
+    def _in_body(self, body: Index, point: np.ndarray) -> np.ndarray:
         """In our frame, that of its inertia."""
         name = self.body(body)
         if name == GROUND:

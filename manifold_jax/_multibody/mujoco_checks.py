@@ -6,6 +6,8 @@ from typing import Any
 import numpy as np
 
 
+Index = int | np.integer
+
 # Attribute of the model, what its entries belong to, and what a user calls it. Any entry that is not
 # zero is refused. Names of older and newer versions.
 REFUSED = (
@@ -41,7 +43,7 @@ def import_mujoco() -> Any:
     return mujoco
 
 
-def name_of(mujoco: Any, model: Any, kind: str, i: int) -> str:
+def name_of(mujoco: Any, model: Any, kind: str, i: Index) -> str:
     """Of an element; `"body 3"` for one without."""
     if kind == "dof":
         kind, i = "joint", model.dof_jntid[i]
@@ -95,9 +97,10 @@ def _disabled(mujoco: Any, model: Any, flag: str) -> bool:
     return bool(model.opt.disableflags & int(bit))
 
 
-def _with_one_coordinate(mujoco: Any, model: Any, joint: int) -> bool:
+def _with_one_coordinate(mujoco: Any, model: Any, joint: Index) -> bool:
     kinds = {int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)}
-    return int(model.jnt_type[joint]) in kinds and model.body_jntnum[model.jnt_bodyid[joint]] == 1
+    alone = int(model.body_jntnum[model.jnt_bodyid[joint]]) == 1
+    return alone and int(model.jnt_type[joint]) in kinds
 
 
 def _forces_of_joints(mujoco: Any, model: Any) -> Iterator[tuple[str, str]]:
@@ -114,7 +117,7 @@ def _forces_of_joints(mujoco: Any, model: Any) -> Iterator[tuple[str, str]]:
             yield "moving body without mass", name_of(mujoco, model, "body", i)
 
 
-def actuator_fault(mujoco: Any, model: Any, i: int) -> str | None:
+def actuator_fault(mujoco: Any, model: Any, i: Index) -> str | None:
     """Why an actuator cannot be a motor in a joint."""
     on_joint = {int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT)}
     biases = {int(mujoco.mjtBias.mjBIAS_NONE), int(mujoco.mjtBias.mjBIAS_AFFINE)}
@@ -129,7 +132,7 @@ def actuator_fault(mujoco: Any, model: Any, i: int) -> str | None:
     return None if int(model.actuator_biastype[i]) in biases else "actuator bias that is not affine"
 
 
-def equality_fault(mujoco: Any, model: Any, e: int) -> str | None:
+def equality_fault(mujoco: Any, model: Any, e: Index) -> str | None:
     known = {int(mujoco.mjtEq.mjEQ_CONNECT), int(mujoco.mjtEq.mjEQ_WELD)}
     kind = int(model.eq_type[e])
     if kind in known:
