@@ -107,7 +107,6 @@ class Assembly(eqx.Module):
         angular_velocities: dict[str, Any] | None = None,
         *,
         assemble: bool = False,
-        t: RealScalarLike = 0.0,
     ) -> tuple[Pose, Pose]:
         """A state `(q, v)`: the drawing at rest, with what is given for some bodies by name.
 
@@ -125,7 +124,7 @@ class Assembly(eqx.Module):
         `redundant` is false.
         """
         given = positions, orientations, velocities, angular_velocities
-        return make_state(self, given, assemble, t)
+        return make_state(self, given, assemble)
 
     def gaps(self, q: Pose) -> dict[str, Float[Array, " r"]]:
         """Residuals of the joints by name: lengths in metres, cosines of angles."""

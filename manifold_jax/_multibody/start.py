@@ -25,7 +25,7 @@ ITERATIONS = 50
 DEPENDENT = 1e-9
 
 
-def make_state(assembly: Any, given: tuple, assemble: bool, t: Any) -> tuple[Pose, Pose]:
+def make_state(assembly: Any, given: tuple, assemble: bool) -> tuple[Pose, Pose]:
     y, fixed = _with_given(assembly, given)
     if not all(is_concrete(leaf) for leaf in jtu.tree_leaves((y, assembly))):
         if assemble:
