@@ -78,7 +78,7 @@ from ._manifolds import (
 
 
 # isort: split
-from . import problems as problems
+from . import multibody as multibody, problems as problems
 
 
 __version__ = version("manifold_jax")

@@ -43,6 +43,8 @@ LAYERS = [
     {"_applications", "_dae", "_ensemble"},
     {"_fit"},
     {"_manifolds", "_lie_groups"},
+    {"_multibody"},
+    {"multibody"},
     {"problems"},
     {"__init__"},
     {"_compare"},

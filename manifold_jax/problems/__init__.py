@@ -1,7 +1,8 @@
 """The problem gallery: vector fields on manifolds whose solutions are known.
 
 Every function builds a [`Problem`][]; its docstring has the equations, the source of
-every number and the digits to trust.
+every number and the digits to trust. `ALL` has those that take seconds to compile: not the
+delta robot and the Stewart platform.
 """
 
 from collections.abc import Callable
@@ -9,6 +10,7 @@ from collections.abc import Callable
 from ._problem import Problem as Problem
 from .car_axis import car_axis as car_axis
 from .chain import chain as chain, double_pendulum as double_pendulum
+from .delta_robot import delta_robot as delta_robot
 from .four_bar import four_bar as four_bar
 from .heavy_top import heavy_top as heavy_top
 from .kepler import kepler as kepler
@@ -22,6 +24,7 @@ from .rolling_disc import rolling_disc as rolling_disc
 from .slider_crank import slider_crank as slider_crank
 from .small_daes import arevalo as arevalo, jay2 as jay2, skate as skate
 from .spherical_pendulum import spherical_pendulum as spherical_pendulum
+from .stewart_platform import stewart_platform as stewart_platform
 
 
 ALL: dict[str, Callable[[], Problem]] = {

@@ -1,0 +1,26 @@
+"""Rigid bodies with joints and forces, as a mechanical system."""
+
+from .assembly import Assembly as Assembly, parametrized as parametrized
+from .bodies import Body as Body, GROUND as GROUND, Pose as Pose
+from .forces import (
+    AbstractForce as AbstractForce,
+    Damper as Damper,
+    Force as Force,
+    JointSpring as JointSpring,
+    LinearActuator as LinearActuator,
+    Motor as Motor,
+    Spring as Spring,
+    Torque as Torque,
+)
+from .joints import (
+    AbstractJoint as AbstractJoint,
+    Cylindrical as Cylindrical,
+    Distance as Distance,
+    Fixed as Fixed,
+    Prismatic as Prismatic,
+    Revolute as Revolute,
+    Spherical as Spherical,
+    Universal as Universal,
+)
+from .mujoco import from_mujoco as from_mujoco, state_of_mujoco as state_of_mujoco
+from .rotations import quaternion as quaternion

@@ -1,0 +1,171 @@
+"""Forces, as a user says them; weight is `gravity` of the assembly. Points are given as for joints.
+
+A `value` is a number or array, or a function `f(t, args)` of the time and the `args` of the solve.
+"""
+
+from typing import Any
+
+import equinox as eqx
+
+
+class AbstractForce(eqx.Module):
+    """What acts on bodies besides their weight."""
+
+    name: eqx.AbstractVar[str | None]
+
+
+class Spring(AbstractForce):
+    """A spring, and damper, between two points: they attract each other with
+    `stiffness (l - length) + damping l'`, `l` their distance, which must not become zero.
+
+    **Arguments:**
+
+    - `first`, `second`: names of bodies, one of them may be `mj.multibody.GROUND`.
+    - `stiffness` (N/m), `length` at which it is slack (m), `damping` (N s/m).
+    - `between`: its ends in the drawing, a pair of points of space; or `points`, a pair in the frames
+        of the bodies.
+    """
+
+    first: str = eqx.field(static=True)
+    second: str = eqx.field(static=True)
+    stiffness: Any = 0.0
+    length: Any = 0.0
+    damping: Any = 0.0
+    between: Any = None
+    points: Any = None
+    name: str | None = eqx.field(static=True, default=None)
+
+    @property
+    def drawn(self):
+        return self.between
+
+    @property
+    def value(self):
+        return 0.0
+
+
+class Damper(AbstractForce):
+    """A damper between two points: they attract each other with `damping l'`. Arguments as for
+    [`Spring`][]."""
+
+    first: str = eqx.field(static=True)
+    second: str = eqx.field(static=True)
+    damping: Any = 0.0
+    between: Any = None
+    points: Any = None
+    name: str | None = eqx.field(static=True, default=None)
+
+    @property
+    def drawn(self):
+        return self.between
+
+    @property
+    def stiffness(self):
+        return 0.0
+
+    @property
+    def length(self):
+        return 0.0
+
+    @property
+    def value(self):
+        return 0.0
+
+
+class LinearActuator(AbstractForce):
+    """A cylinder between two points that pushes them apart with the force `value` (N), a number or
+    `f(t, args)`. Other arguments as for [`Spring`][]."""
+
+    first: str = eqx.field(static=True)
+    second: str = eqx.field(static=True)
+    value: Any
+    between: Any = None
+    points: Any = None
+    name: str | None = eqx.field(static=True, default=None)
+
+    @property
+    def drawn(self):
+        return self.between
+
+    @property
+    def stiffness(self):
+        return 0.0
+
+    @property
+    def length(self):
+        return 0.0
+
+    @property
+    def damping(self):
+        return 0.0
+
+
+class JointSpring(AbstractForce):
+    """A spring, and damper, in a hinge or slider: against its coordinate acts
+    `stiffness (x - rest) + damping x'`.
+
+    **Arguments:**
+
+    - `joint`: the name of a [`Revolute`][] or [`Prismatic`][]. Its coordinate `x`, an angle from
+        `-pi` to `pi` or a distance, is that of the second body against the first, about or along
+        its axis (in the plane counter-clockwise), and zero in the drawing.
+    - `stiffness` (N m/rad or N/m), `rest` (rad or m), `damping` (N m s/rad or N s/m).
+    """
+
+    joint: str = eqx.field(static=True)
+    stiffness: Any = 0.0
+    rest: Any = 0.0
+    damping: Any = 0.0
+    name: str | None = eqx.field(static=True, default=None)
+
+    @property
+    def value(self):
+        return 0.0
+
+
+class Motor(AbstractForce):
+    """A motor in a hinge or slider: the torque (N m) or force (N) `value`, a number or `f(t, args)`, on
+    the second body in the direction of the joint's coordinate, and its opposite on the first.
+
+    **Arguments:** `joint` as for [`JointSpring`][]; `value`.
+    """
+
+    joint: str = eqx.field(static=True)
+    value: Any
+    name: str | None = eqx.field(static=True, default=None)
+
+    @property
+    def stiffness(self):
+        return 0.0
+
+    @property
+    def rest(self):
+        return 0.0
+
+    @property
+    def damping(self):
+        return 0.0
+
+
+class Force(AbstractForce):
+    """A force on a body, in the coordinates of space.
+
+    **Arguments:**
+
+    - `body`: its name. `value` (N): shape `(2,)` or `(3,)`, or `f(t, args)` that returns it.
+    - `point`: where it acts, in the frame of the body; by default at the centre of mass.
+    """
+
+    body: str = eqx.field(static=True)
+    value: Any
+    point: Any = None
+    name: str | None = eqx.field(static=True, default=None)
+
+
+class Torque(AbstractForce):
+    """A torque on a body: `value` (N m), in the coordinates of space, shape `(3,)`, in the plane a
+    number, or `f(t, args)` that returns it. `body`: its name."""
+
+    body: str = eqx.field(static=True)
+    value: Any
+    name: str | None = eqx.field(static=True, default=None)

@@ -1,0 +1,170 @@
+"""What of a MuJoCo model cannot be an assembly, by name."""
+
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import numpy as np
+
+
+Index = int | np.integer
+
+# Attribute of the model, what its entries belong to, and what a user calls it. Any entry that is not
+# zero is refused. Names of older and newer versions.
+REFUSED = (
+    ("jnt_limited", "joint", "joint limit"),
+    ("jnt_actfrclimited", "joint", "actuator force limit"),
+    ("jnt_stiffnesspoly", "joint", "nonlinear stiffness"),
+    ("jnt_springyield", "joint", "plastic spring"),
+    ("dof_frictionloss", "dof", "friction loss"),
+    ("dof_armature", "dof", "armature"),
+    ("dof_dampingpoly", "dof", "nonlinear damping"),
+    ("body_gravcomp", "body", "gravity compensation"),
+    ("actuator_forcelimited", "actuator", "actuator force limit"),
+    ("actuator_armature", "actuator", "armature"),
+    ("actuator_damping", "actuator", "actuator damping"),
+    ("actuator_delay", "actuator", "actuator delay"),
+)
+COUNTED = (
+    ("ntendon", "tendon"),
+    ("nflex", "flex"),
+    ("nplugin", "plugin"),
+    ("nmocap", "mocap body"),
+)
+HINT = "Remove them, or leave them out of the motion by `ignore=(...)` with some of {words}."
+
+
+def import_mujoco() -> Any:
+    try:
+        import mujoco
+    except ImportError:
+        raise ImportError(
+            'MJCF and URDF are read by MuJoCo: `pip install "manifold_jax[mjcf]"`.'
+        ) from None
+    return mujoco
+
+
+def name_of(mujoco: Any, model: Any, kind: str, i: Index) -> str:
+    """Of an element; `"body 3"` for one without."""
+    if kind == "dof":
+        kind, i = "joint", model.dof_jntid[i]
+    code = getattr(mujoco.mjtObj, f"mjOBJ_{kind.upper()}")
+    return mujoco.mj_id2name(model, code, int(i)) or f"{kind} {i}"
+
+
+def refuse_unsupported(mujoco: Any, model: Any, ignore: Sequence[str]) -> None:
+    if isinstance(ignore, str):
+        raise TypeError(f"`ignore` must be a sequence of words, write `ignore=({ignore!r},)`.")
+    found: dict[str, list[str]] = {}
+    for word, name in _unsupported(mujoco, model):
+        if word not in ignore:
+            found.setdefault(word, []).append(name)
+    if found:
+        listed = "; ".join(
+            f"{word}: {', '.join(names[:5])}{', ...' if len(names) > 5 else ''}"
+            for word, names in found.items()
+        )
+        words = ", ".join(map(repr, found))
+        raise ValueError(
+            f"The model has elements that are not supported: {listed}. {HINT.format(words=words)}"
+        )
+
+
+def _unsupported(mujoco: Any, model: Any) -> Iterator[tuple[str, str]]:
+    for attribute, kind, word in REFUSED:
+        entries = np.asarray(getattr(model, attribute, np.zeros(0)))
+        if attribute == "jnt_limited" and _disabled(mujoco, model, "LIMIT"):
+            continue
+        if attribute == "dof_frictionloss" and _disabled(mujoco, model, "FRICTIONLOSS"):
+            continue
+        rows = entries.reshape(entries.shape[0], -1) if entries.size else np.zeros((0, 1))
+        for i in np.flatnonzero(np.any(rows != 0, axis=1)):
+            yield word, name_of(mujoco, model, kind, i)
+    for count, word in COUNTED:
+        for i in range(getattr(model, count, 0)):
+            yield word, (name_of(mujoco, model, word, i) if word == "tendon" else f"{word} {i}")
+    yield from _forces_of_joints(mujoco, model)
+    yield from _elements(mujoco, model)
+    yield from _contacts(mujoco, model)
+    if model.opt.density != 0 or model.opt.viscosity != 0:
+        yield "fluid", "density and viscosity of option"
+    for flag in ("SPRING", "DAMPER"):
+        if _disabled(mujoco, model, flag):
+            yield "disabled springs or dampers", f"flag {flag.lower()}"
+
+
+def _disabled(mujoco: Any, model: Any, flag: str) -> bool:
+    bit = getattr(mujoco.mjtDisableBit, f"mjDSBL_{flag}", 0)
+    return bool(model.opt.disableflags & int(bit))
+
+
+def _with_one_coordinate(mujoco: Any, model: Any, joint: Index) -> bool:
+    kinds = {int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)}
+    alone = int(model.body_jntnum[model.jnt_bodyid[joint]]) == 1
+    return alone and int(model.jnt_type[joint]) in kinds
+
+
+def _forces_of_joints(mujoco: Any, model: Any) -> Iterator[tuple[str, str]]:
+    """Springs and dampers of joints that have no single coordinate here."""
+    for d in range(model.nv):
+        joint = model.dof_jntid[d]
+        if not _with_one_coordinate(mujoco, model, joint) and model.dof_damping[d] != 0:
+            yield "damping of several coordinates", name_of(mujoco, model, "joint", joint)
+    for joint in range(model.njnt):
+        if not _with_one_coordinate(mujoco, model, joint) and model.jnt_stiffness[joint] != 0:
+            yield "stiffness of several coordinates", name_of(mujoco, model, "joint", joint)
+    for i in range(1, model.nbody):
+        if model.body_mass[i] == 0 and model.body_jntnum[i] > 0:
+            yield "moving body without mass", name_of(mujoco, model, "body", i)
+
+
+def actuator_fault(mujoco: Any, model: Any, i: Index) -> str | None:
+    """Why an actuator cannot be a motor in a joint."""
+    on_joint = {int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT)}
+    biases = {int(mujoco.mjtBias.mjBIAS_NONE), int(mujoco.mjtBias.mjBIAS_AFFINE)}
+    if int(model.actuator_trntype[i]) not in on_joint:
+        return "actuator that is not of a joint"
+    if not _with_one_coordinate(mujoco, model, model.actuator_trnid[i, 0]):
+        return "actuator of several coordinates"
+    if int(model.actuator_gaintype[i]) != int(mujoco.mjtGain.mjGAIN_FIXED):
+        return "actuator gain that is not constant"
+    if int(model.actuator_dyntype[i]) != int(mujoco.mjtDyn.mjDYN_NONE):
+        return "actuator dynamics"
+    return None if int(model.actuator_biastype[i]) in biases else "actuator bias that is not affine"
+
+
+def equality_fault(mujoco: Any, model: Any, e: Index) -> str | None:
+    known = {int(mujoco.mjtEq.mjEQ_CONNECT), int(mujoco.mjtEq.mjEQ_WELD)}
+    kind = int(model.eq_type[e])
+    if kind in known:
+        return None
+    return f"equality of type {mujoco.mjtEq(kind).name.removeprefix('mjEQ_').lower()}"
+
+
+def _elements(mujoco: Any, model: Any) -> Iterator[tuple[str, str]]:
+    for i in range(model.nactuator):
+        if fault := actuator_fault(mujoco, model, i):
+            yield fault, name_of(mujoco, model, "actuator", i)
+    for e in range(model.neq):
+        fault = equality_fault(mujoco, model, e)
+        if fault and model.eq_active0[e]:
+            yield fault, name_of(mujoco, model, "equality", e)
+
+
+def _contacts(mujoco: Any, model: Any) -> Iterator[tuple[str, str]]:
+    """The first geometry that may touch another; those of one body, and of a body and its parent
+    that moves, do not."""
+    if _disabled(mujoco, model, "CONTACT"):
+        return
+    if model.npair > 0:
+        yield "contact", "explicit pairs"
+    welded, parents = model.body_weldid, model.body_parentid
+    body = welded[model.geom_bodyid]
+    for i in range(model.ngeom):
+        touches = (model.geom_contype[i] & model.geom_conaffinity) | (
+            model.geom_contype & model.geom_conaffinity[i]
+        )
+        a, b = body[i], body
+        parent = (welded[parents[a]] == b) | (welded[parents[b]] == a)
+        related = (a == b) | (parent & (a != 0) & (b != 0))
+        if np.any((touches != 0) & ~related):
+            yield "contact", name_of(mujoco, model, "geom", i)

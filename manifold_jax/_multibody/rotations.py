@@ -1,0 +1,76 @@
+"""Unit quaternions, scalar first, and what they do to vectors; all for many bodies at once.
+
+Source: Haug, Computer Aided Kinematics and Dynamics of Mechanical Systems (1989), ch. 9.
+"""
+
+from typing import Any
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+
+def quaternion(axis: Any, angle: Any) -> Float[Array, "4"]:
+    """The unit quaternion `(cos(angle/2), sin(angle/2) axis / |axis|)` of a turn about an axis.
+
+    **Arguments:**
+
+    - `axis`: shape `(3,)`, not zero. `angle`: in radian, counter-clockwise seen from its tip.
+    """
+    axis, angle = jnp.asarray(axis, float), jnp.asarray(angle, float)
+    unit = axis / jnp.sqrt(jnp.sum(axis * axis))
+    return jnp.concatenate([jnp.cos(angle / 2)[None], jnp.sin(angle / 2) * unit])
+
+
+def rotation_matrix(p: Float[Array, "*n 4"]) -> Float[Array, "*n 3 3"]:
+    """`R(p)`, which turns vectors of the body into space; quadratic in `p`."""
+    a, b, c, d = p[..., 0], p[..., 1], p[..., 2], p[..., 3]
+    rows = [
+        [a * a + b * b - c * c - d * d, 2 * (b * c - a * d), 2 * (b * d + a * c)],
+        [2 * (b * c + a * d), a * a - b * b + c * c - d * d, 2 * (c * d - a * b)],
+        [2 * (b * d - a * c), 2 * (c * d + a * b), a * a - b * b - c * c + d * d],
+    ]
+    return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def rates_matrix(p: Float[Array, "*n 4"]) -> Float[Array, "*n 3 4"]:
+    """`G(p)`: the angular velocity in the frame of the body is `2 G(p) p'`, and
+    `p' = G(p)^T omega / 2`."""
+    a, b, c, d = p[..., 0], p[..., 1], p[..., 2], p[..., 3]
+    rows = [[-b, a, d, -c], [-c, -d, a, b], [-d, c, -b, a]]
+    return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def planar_rotation(angle: Float[Array, " n"]) -> Float[Array, "n 3 3"]:
+    """The turn by an angle about the third axis."""
+    c, s, zero, one = jnp.cos(angle), jnp.sin(angle), jnp.zeros_like(angle), jnp.ones_like(angle)
+    rows = [[c, -s, zero], [s, c, zero], [zero, zero, one]]
+    return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def turn(R: Float[Array, "n i j"], s: Float[Array, "n j"]) -> Float[Array, "n i"]:
+    """`R_k s_k`; small products as sums, which fuse."""
+    return jnp.sum(R * s[:, None, :], axis=2)
+
+
+def turn_back(R: Float[Array, "n i j"], s: Float[Array, "n i"]) -> Float[Array, "n j"]:
+    """`R_k^T s_k`."""
+    return jnp.sum(R * s[:, :, None], axis=1)
+
+
+def compose(R: Float[Array, "n i j"], S: Float[Array, "n j k"]) -> Float[Array, "n i k"]:
+    """`R_k S_k`."""
+    return jnp.sum(R[:, :, :, None] * S[:, None, :, :], axis=2)
+
+
+def dot(a: Float[Array, "n i"], b: Float[Array, "n i"]) -> Float[Array, " n"]:
+    return jnp.sum(a * b, axis=1)
+
+
+def basis(axis: Float[Array, "n 3"]) -> Float[Array, "n 3 3"]:
+    """Right-handed orthonormal frames whose third column has the direction of `axis`."""
+    w = axis / jnp.sqrt(dot(axis, axis))[:, None]
+    least = jnp.argmin(jnp.abs(w), axis=1)
+    helper = (jnp.arange(3)[None, :] == least[:, None]).astype(w.dtype)
+    u = jnp.cross(helper, w)
+    u = u / jnp.sqrt(dot(u, u))[:, None]
+    return jnp.stack([u, jnp.cross(w, u), w], axis=2)

@@ -1,0 +1,171 @@
+"""States of an assembly: from what a user says of some bodies, and whether they satisfy the joints.
+
+Source of the assembly analysis: Haug, Computer Aided Kinematics and Dynamics of Mechanical Systems
+(1989), ch. 4, here with steps of least norm.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.flatten_util as jfu
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+
+from .bodies import Pose
+from .checks import check_vector, floating, is_concrete
+from .rotations import rates_matrix, rotation_matrix
+
+
+# Joints count as closed below this gap (m, or the cosine of an angle).
+CLOSED = 1e-6
+ITERATIONS = 50
+# Singular values below this fraction of the largest belong to equations that depend on others.
+DEPENDENT = 1e-9
+
+
+def make_state(assembly: Any, given: tuple, assemble: bool) -> tuple[Pose, Pose]:
+    y, fixed = _with_given(assembly, given)
+    if not all(is_concrete(leaf) for leaf in jtu.tree_leaves((y, assembly))):
+        if assemble:
+            raise ValueError(
+                "`assemble=True` is for concrete numbers. Of traced ones build the state without it and move it onto the "
+                "manifold by `mj.consistent_state(system.constraint, t, y)`."
+            )
+        return y
+    find = _Host(assembly, y, fixed)
+    if assemble:
+        y = find.assembled(y)
+    find.check(y)
+    return y
+
+
+def _with_given(assembly: Any, given: tuple) -> tuple[tuple[Pose, Pose], tuple[Pose, Pose]]:
+    """The state, and where it was given."""
+    bodies = assembly.bodies
+    q, d = bodies.drawing, 2 if bodies.planar else 3
+    positions, orientations, velocities, spins = given
+    place = lambda rows, words, what, size: _place(bodies, rows, words or {}, what, size)
+    of_rotation = () if bodies.planar else (4,)
+    x, has_x = place(q.position, positions, "positions", (d,))
+    p, has_p = place(q.orientation, orientations, "orientations", of_rotation)
+    if not bodies.planar:
+        p = p / jnp.sqrt(jnp.sum(p * p, axis=1))[:, None]
+    u, has_u = place(jnp.zeros_like(x), velocities, "velocities", (d,))
+    none = jnp.zeros((x.shape[0], *(() if bodies.planar else (3,))), x.dtype)
+    w, has_w = place(none, spins, "angular_velocities", none.shape[1:])
+    rate = w if bodies.planar else quaternion_rate(p, w)
+    spread = lambda has, like: np.broadcast_to(
+        np.asarray(has).reshape(-1, *(1,) * (like.ndim - 1)), like.shape
+    )
+    fixed = Pose(spread(has_x, x), spread(has_p, p)), Pose(spread(has_u, x), spread(has_w, p))
+    return (Pose(x, p), Pose(u, rate)), fixed
+
+
+def quaternion_rate(p: Any, spin: Any) -> Any:
+    """`p' = G(p)^T R(p)^T omega / 2` of angular velocities in space, `(..., 3)`."""
+    local = jnp.sum(rotation_matrix(p) * spin[..., :, None], axis=-2)
+    return jnp.sum(rates_matrix(p) * local[..., :, None], axis=-2) / 2
+
+
+def _place(bodies: Any, rows: Any, words: dict, what: str, shape: tuple) -> tuple[Any, list]:
+    if not isinstance(words, dict):
+        raise TypeError(f"`{what}` must be a dictionary of names of bodies, got {words!r}.")
+    has = [False] * rows.shape[0]
+    for name, value in words.items():
+        i = bodies.index(name, f"`{what}`")
+        if i == len(has):
+            raise ValueError(f"`{what}`: the ground does not move.")
+        if shape:
+            value = check_vector(f"`{what}` of {name!r}", value, shape[0])
+        rows, has[i] = rows.at[i].set(floating(value)), True
+    return rows, has
+
+
+class _Host:
+    """The equations of an assembly and their Jacobians as NumPy arrays."""
+
+    def __init__(self, assembly: Any, y: tuple[Pose, Pose], fixed: tuple[Pose, Pose]):
+        self.assembly, self.fixed = assembly, fixed
+        self.unravel = jfu.ravel_pytree(y[0])[1]
+        phi = lambda x: jfu.ravel_pytree(assembly._equations(self.unravel(x)))[0]
+        self.equations: Callable = jax.jit(lambda x: (phi(x), jax.jacfwd(phi)(x)))
+
+    def __call__(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        phi, J = self.equations(x)
+        return np.asarray(phi), np.asarray(J)
+
+    def assembled(self, y: tuple[Pose, Pose]) -> tuple[Pose, Pose]:
+        """Gauss-Newton steps of least norm in what is free; velocities by one."""
+        x, w = (np.array(jfu.ravel_pytree(part)[0]) for part in y)
+        kept_x, kept_w = (
+            np.concatenate([np.ravel(leaf) for leaf in jtu.tree_leaves(part)])
+            for part in self.fixed
+        )
+        for _ in range(ITERATIONS):
+            phi, J = self(x)
+            if np.abs(phi).max(initial=0) < 10 * np.finfo(x.dtype).eps:
+                break
+            x[~kept_x] -= np.linalg.lstsq(J[:, ~kept_x], phi, rcond=DEPENDENT)[0]
+        self.check_positions(x, " Whatever the other bodies do, the joints cannot be closed")
+        _, J = self(x)
+        w[~kept_w] -= np.linalg.lstsq(J[:, ~kept_w], J @ w, rcond=DEPENDENT)[0]
+        return self.unravel(jnp.asarray(x)), self.unravel(jnp.asarray(w))
+
+    def check(self, y: tuple[Pose, Pose]) -> None:
+        x, w = (np.array(jfu.ravel_pytree(part)[0]) for part in y)
+        self.check_positions(x, "")
+        _, J = self(x)
+        rate = np.abs(J @ w)
+        if not rate.max(initial=0) <= CLOSED * max(1, np.abs(w).max()):
+            raise ValueError(
+                f"The velocities do not agree with the joints: {self._worst(rate, 'm/s')}. Give only those that are known, "
+                "such that joints allow them, and `assemble=True`."
+            )
+        if not self.assembly.redundant:
+            self._check_rank(J)
+
+    def check_positions(self, x: np.ndarray, reason: str) -> None:
+        gap = np.abs(self(x)[0])
+        if not gap.max(initial=0) <= CLOSED:
+            advice = (
+                f"{reason}: check lengths and points, or give less."
+                if reason
+                else " Give `assemble=True` to close them, or correct positions and orientations."
+            )
+            raise ValueError(
+                f"The state does not satisfy the joints: {self._worst(gap, 'm')}.{advice}"
+            )
+
+    def _worst(self, size: np.ndarray, unit: str) -> str:
+        largest = [size[rows].max() for _, rows in self._rows()]
+        order = np.argsort(largest)[::-1][:5]
+        worst = [(self._rows()[i][0], largest[i]) for i in order if largest[i] > CLOSED]
+        return ", ".join(f"{name} (gap {gap:.3g} {unit})" for name, gap in worst)
+
+    def _rows(self) -> list[tuple[str, np.ndarray]]:
+        """The rows of every joint among the equations."""
+        named, start = [], 0
+        still_there = self.assembly._equations(self.assembly.bodies.drawing)
+        for group, part in zip(self.assembly.joints, still_there, strict=False):
+            rows = start + np.arange(part.size).reshape(part.shape)
+            named += list(zip(group.attachment.names, rows, strict=True))
+            start += part.size
+        norms = self.assembly.bodies.names if not self.assembly.bodies.planar else ()
+        named += [(f"norm of {name!r}", np.array([start + i])) for i, name in enumerate(norms)]
+        return named
+
+    def _check_rank(self, J: np.ndarray) -> None:
+        J = J / np.maximum(np.linalg.norm(J, axis=1, keepdims=True), np.finfo(J.dtype).tiny)
+        left, sizes, _ = np.linalg.svd(J, full_matrices=True)
+        rank = int(np.sum(sizes > DEPENDENT * sizes.max(initial=1)))
+        if rank == J.shape[0]:
+            return
+        among = np.abs(left[:, rank:]).max(axis=1)
+        names = [name for name, rows in self._rows() if among[rows].max() > 1e-6]
+        raise ValueError(
+            f"{J.shape[0] - rank} of the {J.shape[0]} equations of the joints depend on others in this pose, among those of "
+            f"{', '.join(names[:10])}{', ...' if len(names) > 10 else ''}. If they do so in every pose (closed loops), "
+            "write `Assembly(..., redundant=True)`; if in this one alone, start beside it."
+        )

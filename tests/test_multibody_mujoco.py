@@ -1,0 +1,223 @@
+"""Assemblies from MJCF and URDF: accelerations are MuJoCo's, what is not supported is refused."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import multibody_cases as cases
+import numpy as np
+import pytest
+
+import manifold_jax as mj
+
+
+mujoco = pytest.importorskip("mujoco")
+mb = mj.multibody
+
+
+@eqx.filter_jit
+def accelerations(robot, y, args):
+    """Of the centres of mass, and of the angular velocities in space."""
+    a = robot.system.accelerations(0.0, y, args)
+    ahead = y[1], a
+    spins = lambda y: jnp.stack([robot.motion(y, n).angular_velocity for n in robot.names])
+    return a.position, eqx.filter_jvp(spins, (y,), (ahead,))[1]
+
+
+def those_of_mujoco(robot, model, data):
+    mujoco.mj_rnePostConstraint(model, data)
+    both, kind, rows = np.zeros(6), mujoco.mjtObj.mjOBJ_BODY, []
+    for name in robot.names:
+        i = mujoco.mj_name2id(model, kind, name)
+        mujoco.mj_objectAcceleration(model, data, kind, i, both, 0)
+        rows.append(both.copy())
+    rows = np.array(rows)
+    return rows[:, 3:] + model.opt.gravity, rows[:, :3]
+
+
+class RandomTree:
+    """MJCF of a tree with every joint that is read, in random places."""
+
+    def __init__(self, seed):
+        self.rng = np.random.default_rng(seed)
+        types = ["hinge", "slide", "ball", "universal", "cylindrical", "none"]
+        self.types = [str(t) for t in self.rng.permutation(types)] + ["free", "hinge"]
+        self.parents = [-1] + [int(self.rng.integers(-1, i)) for i in range(1, 6)] + [-1, 6]
+
+    def numbers(self, size=1.0, n=3):
+        return " ".join(f"{x:.17g}" for x in size * self.rng.normal(size=n))
+
+    def positive(self, low, high):
+        return f"{self.rng.uniform(low, high):.17g}"
+
+    def joint(self, i):
+        kind, at = self.types[i], self.numbers(0.3)
+        if kind in ("hinge", "slide"):
+            spring = f'stiffness="{self.positive(0, 2)}" springref="{self.positive(-0.3, 0.3)}"'
+            spring += f' damping="{self.positive(0, 0.5)}"'
+            axis = self.numbers()
+            return f'<joint name="j{i}" type="{kind}" pos="{at}" axis="{axis}" {spring}/>'
+        if kind == "universal":
+            axes = np.linalg.qr(self.rng.normal(size=(3, 3)))[0][:2]
+            hinge = '<joint type="hinge" pos="{}" axis="{:.17g} {:.17g} {:.17g}"/>'
+            return "".join(hinge.format(at, *axis) for axis in axes)
+        if kind == "cylindrical":
+            axis = self.numbers()
+            slide = f'<joint type="slide" axis="{axis}"/>'
+            return slide + f'<joint type="hinge" pos="{at}" axis="{axis}"/>'
+        others = {"ball": f'<joint type="ball" pos="{at}"/>', "free": "<freejoint/>", "none": ""}
+        return others[kind]
+
+    def body(self, i):
+        moments = " ".join(self.positive(0.5, 0.9) for _ in range(3))
+        inertial = (
+            f'<inertial pos="{self.numbers(0.2)}" quat="{self.numbers(1, 4)}" mass="{self.positive(0.5, 2)}" '
+            f'diaginertia="{moments}"/>'
+        )
+        place = f'name="b{i}" pos="{self.numbers(0.5)}" quat="{self.numbers(1, 4)}"'
+        children = "".join(self.body(k) for k, parent in enumerate(self.parents) if parent == i)
+        return f"<body {place}>{self.joint(i)}{inertial}{children}</body>"
+
+    def xml(self):
+        bodies = "".join(self.body(i) for i, parent in enumerate(self.parents) if parent == -1)
+        motors = "".join(
+            f'<motor joint="j{i}" gear="{self.positive(0.5, 2)}" ctrllimited="true" ctrlrange="-1 1"/>'
+            f'<position joint="j{i}" kp="{self.positive(0.5, 2)}"/>'
+            for i, kind in enumerate(self.types)
+            if kind in ("hinge", "slide")
+        )
+        return (
+            f'<mujoco><option gravity="{self.numbers(5)}"/><worldbody>{bodies}</worldbody>'
+            f"<actuator>{motors}</actuator></mujoco>"
+        )
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_accelerations_of_random_trees(seed):
+    tree = RandomTree(seed)
+    model = mujoco.MjModel.from_xml_string(tree.xml())
+    robot = mb.from_mujoco(model, control=lambda t, args: args)
+    data = mujoco.MjData(model)
+    # away from the drawing, and moving
+    mujoco.mj_integratePos(model, data.qpos, 0.5 * tree.rng.normal(size=model.nv), 1.0)
+    data.qvel[:] = tree.rng.normal(size=model.nv)
+    data.ctrl[:] = 1.5 * tree.rng.normal(size=model.nu)
+    y = mb.state_of_mujoco(robot, model, data)
+    gaps = robot.gaps(y[0]).values()
+    assert max(np.abs(gap).max() for gap in gaps) < 1e-14
+    actual = accelerations(robot, y, jnp.asarray(data.ctrl))
+    for ours, theirs in zip(actual, those_of_mujoco(robot, model, data)):
+        assert np.abs(theirs).max() > 1
+        np.testing.assert_allclose(ours, theirs, rtol=0, atol=1e-11)
+
+
+def test_a_loop_closed_by_an_equality():
+    """The four-bar linkage of the gallery at rest."""
+    problem = mj.problems.four_bar()
+    q = np.asarray(problem.y0[0]).reshape(3, 3)
+    masses, lengths = np.asarray(problem.args.masses), np.asarray(problem.args.lengths)
+    angles = np.degrees(np.diff(q[:, 2] + [0, 0, np.pi], prepend=0.0))
+    rods = [
+        '<inertial pos="{:.17g} 0 0" mass="{:.17g}" diaginertia="{:.17g} {:.17g} {:.17g}"/>'.format(
+            length / 2, m, *(m * length**2 / 12 * np.array([0.1, 1.0, 1.0]))
+        )
+        for m, length in zip(masses, lengths)
+    ]
+    xml = f"""<mujoco><option gravity="0 0 -{float(problem.args.gravity)}"/><worldbody>
+    <body name="crank" axisangle="0 -1 0 {angles[0]:.17g}"><joint axis="0 -1 0"/>{rods[0]}
+     <body name="coupler" pos="{lengths[0]:.17g} 0 0" axisangle="0 -1 0 {angles[1]:.17g}"><joint axis="0 -1 0"/>{rods[1]}
+      <body name="rocker" pos="{lengths[1]:.17g} 0 0" axisangle="0 -1 0 {angles[2]:.17g}"><joint axis="0 -1 0"/>{rods[2]}
+    </body></body></body></worldbody>
+    <equality><connect name="closing" body1="rocker" anchor="{lengths[2]:.17g} 0 0"/></equality></mujoco>"""
+    robot = mb.from_mujoco(xml, redundant=True)
+    assert robot.names == cases.BARS
+    y = robot.state()
+    a, _ = accelerations(robot, y, None)
+    flat = cases.four_bar(problem.args)
+    by_name = lambda rows: dict(zip(cases.BARS, rows))
+    still = flat.state(by_name(q[:, :2]), by_name(q[:, 2]))
+    expected = eqx.filter_jit(flat.system.accelerations)(0.0, still).position
+    np.testing.assert_allclose(a[:, [0, 2]], expected, rtol=0, atol=1e-10)
+
+
+WELDED = """
+<mujoco><worldbody>
+<body name="a"><freejoint/><inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/></body>
+<body name="b" pos="0 0 1"><freejoint/><inertial pos="0 0 0" mass="3" diaginertia="1 1 1"/></body>
+</worldbody><equality><weld name="glue" body1="a" body2="b" {}/></equality></mujoco>
+"""
+
+
+def test_a_weld_holds_bodies_as_they_are():
+    robot = mb.from_mujoco(WELDED.format(""))
+    assert robot.joint_names == ("glue",)
+    a, _ = accelerations(robot, robot.state(), None)
+    np.testing.assert_allclose(a, [[0, 0, -9.81]] * 2, atol=1e-12)
+    with pytest.raises(ValueError, match="The weld 'glue' holds its bodies in another pose"):
+        mb.from_mujoco(WELDED.format('relpose="0 0 2 1 0 0 0"'))
+
+
+def test_urdf():
+    robot = mb.from_mujoco(
+        """<robot name="arm"><link name="base"/><link name="rod"><inertial><mass value="2"/>
+        <origin xyz="0 0 -0.5"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link>
+        <joint name="pin" type="continuous"><parent link="base"/><child link="rod"/>
+        <axis xyz="0 1 0"/></joint></robot>"""
+    )
+    assert robot.names == ("rod",)
+    assert robot.joint_names == ("pin",)
+
+
+BODY = """<mujoco><worldbody><body name="bob">{}<geom name="ball" size="0.1" {}/></body>{}
+</worldbody>{}</mujoco>"""
+FREE = '<joint name="j"/>'
+QUIET = 'contype="0"'
+
+
+@pytest.mark.parametrize(
+    ("parts", "message"),
+    [
+        (('<joint name="j" range="-1 1" limited="true"/>', QUIET, "", ""), "joint limit: j"),
+        (('<joint name="j" frictionloss="1"/>', QUIET, "", ""), "friction loss: j"),
+        (('<joint name="j" armature="1"/>', QUIET, "", ""), "armature: j"),
+        (('<joint name="j" type="ball" damping="1"/>', QUIET, "", ""), "damping of several .*: j"),
+        ((FREE, "", '<geom name="floor" type="plane" size="1 1 1"/>', ""), "contact: .*ball"),
+        (
+            (FREE, QUIET, "", '<tendon><fixed name="rope"><joint joint="j" coef="1"/></fixed></tendon>'),
+            "tendon: rope",
+        ),
+        (
+            (FREE, QUIET, "", '<equality><joint name="gears" joint1="j"/></equality>'),
+            "equality of type joint: gears",
+        ),
+        (
+            (FREE, QUIET, "", '<actuator><general name="lag" joint="j" dyntype="filter"/></actuator>'),
+            "actuator dynamics: lag",
+        ),
+        (
+            (FREE, QUIET, '<body name="m" mocap="true"/>', ""),
+            "mocap body",
+        ),
+        (
+            ('<joint name="j"/><joint name="k" pos="1 0 0"/>', QUIET, "", ""),
+            r"'bob' has the joints 'j k' \(hinge, hinge\)",
+        ),
+    ],
+)  # fmt: skip
+def test_what_is_refused(parts, message):
+    with pytest.raises(ValueError, match=message):
+        mb.from_mujoco(BODY.format(*parts))
+
+
+def test_what_is_left_out_on_request():
+    xml = BODY.format('<joint name="j" range="-1 1" limited="true"/>', QUIET, "", "")
+    robot = mb.from_mujoco(xml, ignore=("joint limit",))
+    assert robot.joint_names == ("j",)
+    with pytest.raises(TypeError, match="sequence of words"):
+        mb.from_mujoco(xml, ignore="joint limit")
+    with pytest.raises(TypeError, match="`model` must be"):
+        mb.from_mujoco(3)
+    robot = mb.from_mujoco(
+        BODY.format(FREE, QUIET, "", '<actuator><motor joint="j"/></actuator>'),
+        control=lambda t, args: jnp.zeros(()),
+    )
+    with pytest.raises(ValueError, match=r"shape \(nu,\)"):
+        accelerations(robot, robot.state(), None)
