@@ -6,7 +6,7 @@ is therefore written out entry by entry; beyond that the library routine is used
 """
 
 import abc
-from typing import Any, TypeAlias
+from typing import Any, TYPE_CHECKING, TypeAlias
 
 import equinox as eqx
 import jax
@@ -50,7 +50,10 @@ class AbstractRows(eqx.Module):
         """Those of `function(t, x, args)` at `x`, of the same structure."""
 
 
-Rows: TypeAlias = Float[Array, "_ _"] | AbstractRows
+if TYPE_CHECKING:
+    Rows: TypeAlias = Any  # whoever knows that they are an array uses them as one
+else:
+    Rows: TypeAlias = Float[Array, "_ _"] | AbstractRows
 
 
 class Factorization(eqx.Module):

@@ -56,7 +56,7 @@ def cancelled(
         gone = constant & _vanishes(jacobians, rows, weights[used])
         leading = aliases.merged(gone[None])[0]
         highest = layout.structure.d - layout.structure.c[used[0]]
-        stands = aliases.merged(occurrence.there[rows].any(axis=0)[None])[0]
+        stands = aliases.merged(occurrence.there[rows].any(axis=0)[None])[0]  # pyright: ignore[reportIndexIssue]
         columns = np.arange(len(highest))
         inside = highest >= 0
         at = np.maximum(highest, 0), columns

@@ -201,7 +201,7 @@ def _check_concrete(x: Any, args: Any) -> None:
 
 
 def _structurally_singular(equations: Equations, occurrence: Occurrence) -> str:
-    parts, names = SingularParts.of(occurrence.there.any(axis=1)), equations.names
+    parts, names = SingularParts.of(occurrence.there.any(axis=1)), equations.names  # pyright: ignore[reportArgumentType]
     named = lambda part: (
         listed([names.equations[i] for i in part[0]]),
         listed([names.unknowns[j] for j in part[1]]) or "none",

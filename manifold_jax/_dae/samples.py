@@ -36,7 +36,7 @@ class Samples(NamedTuple):
     ) -> "Samples":
         """`implicit`: the matrix may depend on the leading derivatives."""
         nothing = np.zeros(0, int)
-        elimination = Elimination(*[nothing] * 4, 0)
+        elimination = Elimination(*[nothing] * 4, 0)  # pyright: ignore[reportCallIssue]
         example = np.asarray(point.jets[0])
         plan = Plan(
             layout, entries, elimination, equations.order, layout.structure, example, implicit

@@ -100,7 +100,7 @@ class Kinematics(NamedTuple):
         if self.holonomic is not None:
             equations.append((lambda x: self.position(t, x, args), x))
         if self.nonholonomic is not None:
-            extra = lambda w: self.nonholonomic(t, self.unravel(x), self.unravel(w), args)
+            extra = lambda w: self.nonholonomic(t, self.unravel(x), self.unravel(w), args)  # pyright: ignore[reportOptionalCall]
             equations.append((lambda w: jfu.ravel_pytree(extra(w))[0], w))
         mass = jax.eval_shape(lambda: self.mass_values(t, x, w, args))
         return choose_structure(self.structure, tuple(equations), mass.shape)

@@ -56,7 +56,7 @@ class Mass(eqx.Module):
     def solve(self, rows: Float[Array, "*k n"]) -> Float[Array, "*k n"]:
         """`M^-1` applied to each row."""
         if self.factorization is None:
-            return rows / jnp.broadcast_to(self.diagonal, rows.shape)
+            return rows / jnp.broadcast_to(self.diagonal, rows.shape)  # pyright: ignore[reportArgumentType]
         if self.factorization.full_rank.ndim == 0:
             return self.factorization.solve(rows.T).T
         number, size = self.factorization.A.shape[:2]

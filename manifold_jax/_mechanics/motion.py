@@ -55,10 +55,10 @@ class Motion:
     def _satisfied(self, accelerations, free, force, bias) -> BoolScalar:
         """Whether `C a = -bias`, for factorizations of which the rank is not known: a missing entry
         or dependent equations show in that, unless their accelerations are right nevertheless."""
-        rates = jnp.max(jnp.abs(bias) / self.factorization.lengths)
+        rates = jnp.max(jnp.abs(bias) / self.factorization.lengths)  # pyright: ignore[reportAttributeAccessIssue]
         size = rates + jnp.sqrt(jnp.max(jnp.abs(free * force)))  # as `M free = force`
         residual = multiply(self.C, accelerations) + bias
-        return self.factorization.solves(residual, size)
+        return self.factorization.solves(residual, size)  # pyright: ignore[reportAttributeAccessIssue]
 
     def constrained(self, b: Float[Array, " m"]) -> Float[Array, " n"]:
         """The smallest change of the velocities, in the metric of the masses, with `C dv = b`."""

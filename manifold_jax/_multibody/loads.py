@@ -222,7 +222,7 @@ def _lines(bodies: Bodies, groups: Any, things: list, names: list[str], kind: st
     axes = [(np.array([0.0, 0.0, 1.0]),) * 2] * len(things)
     attachment = attach(bodies, things, names, axes)
     numbers = _numbers(things, names, "stiffness", "length", "damping")
-    return LineLoads(attachment, *numbers, _values(things))
+    return LineLoads(attachment, *numbers, _values(things))  # pyright: ignore[reportCallIssue]
 
 
 def _in_joints(
@@ -234,9 +234,9 @@ def _in_joints(
     pick = lambda part, side: stack([getattr(g.attachment, part)[side][i] for g, i in found])
     both: Callable = lambda part: tuple(pick(part, side) for side in (0, 1))
     index = tuple(tuple(g.attachment.bodies[side][i] for g, i in found) for side in (0, 1))
-    attachment = Attachment(tuple(names), index, both("points"), both("axes"))
+    attachment = Attachment(tuple(names), index, both("points"), both("axes"))  # pyright: ignore[reportArgumentType]
     numbers = _numbers(things, names, "stiffness", "rest", "damping")
-    return JointLoads(kind == "hinge", attachment, *numbers, _values(things))
+    return JointLoads(kind == "hinge", attachment, *numbers, _values(things))  # pyright: ignore[reportCallIssue]
 
 
 def _on_bodies(bodies: Bodies, groups: Any, things: list, names: list[str], kind: str) -> BodyLoads:

@@ -256,7 +256,7 @@ class _Tree:
             at = model.jnt_qposadr[j]
             if stiffness != 0 or damping != 0:
                 rest = model.qpos_spring[at] - model.qpos0[at]
-                found.append(JointSpring(name, stiffness, rest, damping))
+                found.append(JointSpring(name, stiffness, rest, damping))  # pyright: ignore[reportArgumentType]
         return found
 
     def actuators(self, control: Callable | None) -> list[AbstractForce]:
@@ -274,11 +274,11 @@ class _Tree:
             bias = model.actuator_biasprm[i, :3] * (model.actuator_biastype[i] == affine)
             limits = tuple(map(float, model.actuator_ctrlrange[i]))
             limits = limits if model.actuator_ctrllimited[i] else (-np.inf, np.inf)
-            drive = _Drive(control, int(model.actuator_ctrladr[i]), gear * gain, limits)
-            found.append(Motor(joint, _Sum(drive, gear * float(bias[0])), name=name))
+            drive = _Drive(control, int(model.actuator_ctrladr[i]), gear * gain, limits)  # pyright: ignore[reportArgumentType]
+            found.append(Motor(joint, _Sum(drive, gear * float(bias[0])), name=name))  # pyright: ignore[reportCallIssue]
             if bias[1] != 0 or bias[2] != 0:
                 stiffness, damping = -(gear**2) * bias[1], -(gear**2) * bias[2]
-                found.append(JointSpring(joint, stiffness, -zero, damping, name=f"{name} bias"))
+                found.append(JointSpring(joint, stiffness, -zero, damping, name=f"{name} bias"))  # pyright: ignore[reportCallIssue]
         return found
 
 

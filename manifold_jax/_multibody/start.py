@@ -59,7 +59,7 @@ def _with_given(assembly: Any, given: tuple) -> tuple[tuple[Pose, Pose], tuple[P
     spread = lambda has, like: np.broadcast_to(
         np.asarray(has).reshape(-1, *(1,) * (like.ndim - 1)), like.shape
     )
-    fixed = Pose(spread(has_x, x), spread(has_p, p)), Pose(spread(has_u, x), spread(has_w, p))
+    fixed = Pose(spread(has_x, x), spread(has_p, p)), Pose(spread(has_u, x), spread(has_w, p))  # pyright: ignore[reportArgumentType]
     return (Pose(x, p), Pose(u, rate)), fixed
 
 

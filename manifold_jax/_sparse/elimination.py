@@ -188,14 +188,14 @@ def _times(A: Float[Array, "*b w w"], B: Float[Array, "*b w w"]) -> Float[Array,
     width = A.shape[-1]
     if width > _WRITTEN_OUT:
         return A @ B
-    return sum(A[..., :, k, None] * B[..., None, k, :] for k in range(width))
+    return sum(A[..., :, k, None] * B[..., None, k, :] for k in range(width))  # pyright: ignore[reportReturnType]
 
 
 def _apply(A: Float[Array, "*b w w"], x: Float[Array, "*c w"]) -> Float[Array, "*b w"]:
     width = A.shape[-1]
     if width > _WRITTEN_OUT:
         return jnp.einsum("...ij,...j->...i", A, x)
-    return sum(A[..., :, k] * x[..., None, k] for k in range(width))
+    return sum(A[..., :, k] * x[..., None, k] for k in range(width))  # pyright: ignore[reportReturnType]
 
 
 def _inverse(A: Float[Array, "*b w w"]) -> Float[Array, "*b w w"]:

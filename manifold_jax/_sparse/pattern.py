@@ -38,7 +38,7 @@ def dependence(function: Callable, x: Float[Array, " n"]) -> sp.csr_matrix | Non
         rows, columns = _kept(rows, columns, group, depends)
         if len(rows) == before:
             break
-    return sp.csr_matrix((np.ones(len(rows), bool), (rows, columns)), (len(depends), n))
+    return sp.csr_matrix((np.ones(len(rows), bool), (rows, columns)), (len(depends), n))  # pyright: ignore[reportArgumentType]
 
 
 def _hashed(function, x, random) -> tuple[np.ndarray, np.ndarray]:

@@ -5,6 +5,7 @@ from collections.abc import Callable
 from typing import Any, Literal, TypeAlias
 
 import jax
+import jax.core
 import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Array, Float
@@ -34,7 +35,7 @@ class Structure:
     """
 
     def __init__(self, depends: sp.csr_matrix, per_block: int):
-        self.num_equations, self.num_unknowns = depends.shape
+        self.num_equations, self.num_unknowns = depends.shape  # pyright: ignore[reportGeneralTypeIssues]
         self._depends = depends
         blocks = _merged(depends, per_block)
         coupled = (blocks @ blocks.T).tocoo()
@@ -129,17 +130,17 @@ def _constant(value: Any) -> Any:
 def _merged(depends: sp.csr_matrix, per_block: int) -> sp.csr_matrix:
     """Columns of the same block of masses joined."""
     if per_block == 1:
-        return depends.astype(np.int64)
+        return depends.astype(np.int64)  # pyright: ignore[reportReturnType]
     entries = depends.tocoo()
-    shape = entries.shape[0], -(-entries.shape[1] // per_block)
+    shape = entries.shape[0], -(-entries.shape[1] // per_block)  # pyright: ignore[reportOptionalSubscript]
     joined = sp.csr_matrix((entries.data, (entries.row, entries.col // per_block)), shape)
     joined.sum_duplicates()
-    return joined.astype(np.int64)
+    return joined.astype(np.int64)  # pyright: ignore[reportReturnType]
 
 
 def _best_order(coupled: sp.coo_matrix) -> tuple[np.ndarray | None, int]:
     """The given order, or that of Cuthill and McKee (Proc. 24th ACM Nat. Conf. (1969) 157-172)."""
-    own = np.arange(coupled.shape[0])
+    own = np.arange(coupled.shape[0])  # pyright: ignore[reportOptionalSubscript]
     order = np.asarray(reverse_cuthill_mckee(coupled.tocsr(), symmetric_mode=True))
     given, reordered = _width(coupled, own), _width(coupled, np.argsort(order))
     return (None, given) if given <= reordered else (order, reordered)
@@ -156,9 +157,9 @@ def _width(coupled: sp.coo_matrix, place: np.ndarray) -> int:
 def _colored(depends: sp.csr_matrix) -> np.ndarray:
     """Greedily (Curtis, Powell & Reid, J. Inst. Maths Applics 13 (1974) 117-119)."""
     by_column = depends.tocsc()
-    taken: list[set[int]] = [set() for _ in range(depends.shape[0])]
-    colors = np.zeros(depends.shape[1], np.int32)
-    for j in range(depends.shape[1]):
+    taken: list[set[int]] = [set() for _ in range(depends.shape[0])]  # pyright: ignore[reportOptionalSubscript]
+    colors = np.zeros(depends.shape[1], np.int32)  # pyright: ignore[reportOptionalSubscript]
+    for j in range(depends.shape[1]):  # pyright: ignore[reportOptionalSubscript]
         rows = by_column.indices[by_column.indptr[j] : by_column.indptr[j + 1]]
         used = functools.reduce(set.union, [taken[i] for i in rows], set())
         color = next(color for color in range(len(used) + 1) if color not in used)

@@ -181,8 +181,8 @@ def _exact(t: np.ndarray, args: StewartPlatformArgs, y0: Any) -> State:
         p_rate = _spinning(np, p, state[10:])
         rows.append(_bodies(np, state[:3], p, state[7:10], p_rate, args))
     stacked = lambda side, part: np.stack([getattr(row[side], part) for row in rows])
-    poses = (Pose(stacked(side, "position"), stacked(side, "orientation")) for side in (0, 1))
-    return tuple(poses)
+    poses = (Pose(stacked(side, "position"), stacked(side, "orientation")) for side in (0, 1))  # pyright: ignore[reportArgumentType]
+    return tuple(poses)  # pyright: ignore[reportReturnType]
 
 
 def _twist_equation(args: StewartPlatformArgs) -> Any:
@@ -210,7 +210,8 @@ def _twist_equation(args: StewartPlatformArgs) -> Any:
         linear, angular = velocities(x, R, units[:, :3], units[:, 3:])
         turned = np.cross(w, R.T).T  # w x R, column by column
         bias, turning_bias = (
-            part.imag / tiny for part in velocities(x + 1j * tiny * u, R + 1j * tiny * turned, u, w)
+            np.imag(part) / tiny
+            for part in velocities(x + 1j * tiny * u, R + 1j * tiny * turned, u, w)
         )
         length, frames = _legs(np, base, local @ R.T + x, first_axes)
         n = frames[..., 2]
