@@ -52,7 +52,14 @@ def _linked(text: str, files: Files) -> str:
 
 def on_page_markdown(markdown: str, **_: Any) -> str:
     """Docstrings refer to `[Projected][]` or `[mj.Projected][]`: anchors with these names."""
-    return _OBJECT.sub(r"[](){#\1}\n[](){#mj.\1}\n\n\g<0>", markdown)
+    return _OBJECT.sub(_with_anchors, markdown)
+
+
+def _with_anchors(match: re.Match[str]) -> str:
+    name = match[1]
+    # Within `mj.multibody` docstrings leave that out.
+    anchors = (name, f"mj.{name}", *re.findall(r"^multibody\.(\w+)$", name))
+    return "\n".join(f"[](){{#{anchor}}}" for anchor in anchors) + f"\n\n{match[0]}"
 
 
 def on_page_content(html: str, page: Any, **_: Any) -> str:

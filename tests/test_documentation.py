@@ -14,7 +14,7 @@ PAGES = ROOT / "docs" / "pages"
 
 
 def public_names():
-    for module, prefix in ((mj, ""), (mj.problems, "problems.")):
+    for module, prefix in ((mj, ""), (mj.problems, "problems."), (mj.multibody, "multibody.")):
         for name, x in vars(module).items():
             if not name.startswith("_") and getattr(x, "__module__", "").startswith("manifold_jax"):
                 yield prefix + name

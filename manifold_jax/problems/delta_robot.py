@@ -178,7 +178,7 @@ def delta_robot(
     $$M q'' = Q - J^T \lambda, \quad \tfrac12 (|d_k|^2 / L - L) = 0, \quad k = 1, \dots, 6,$$
 
     five equations for each hinge, and the norms of the quaternions: 25 for 28 coordinates. A spring
-    in each hinge, slack when its arm is horizontal. An assembly of [`multibody`][]. The state is
+    in each hinge, slack when its arm is horizontal. An assembly of `mj.multibody`. The state is
     `(q, v)`, both of positions `(4, 3)` and orientations `(4, 4)` of arms and platform. It starts
     with horizontal arms and a push.
 

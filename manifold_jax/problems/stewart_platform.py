@@ -255,7 +255,7 @@ def stewart_platform(
 
     four equations for each universal joint, five for each slider, three for each ball joint and the
     norms of the quaternions: 85 for 91 coordinates. A spring in each leg; z upwards. An assembly of
-    [`multibody`][]. The state is `(q, v)`, both of positions `(13, 3)` and orientations
+    `mj.multibody`. The state is `(q, v)`, both of positions `(13, 3)` and orientations
     `(13, 4)` of the platform and of cylinder and piston of each leg in turn. It starts level, with a
     push. Large: some tens of seconds to compile.
 
