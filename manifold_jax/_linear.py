@@ -171,7 +171,8 @@ def _product(A: Float[Array, "i j"], B: Float[Array, "j ..."]) -> Float[Array, "
 
 
 class PseudoInverse(eqx.Module):
-    """`A^+`: for equations that depend on each other the solution of least norm.
+    """`A^+`: for equations that depend on each other the solution of least norm, where the matrix is
+    equilibrated with each unknown multiplied by the square root of its diagonal entry.
 
     Its derivative (constant rank; Golub & Pereyra 1973) is that of `jnp.linalg.pinv`.
     """
@@ -190,7 +191,7 @@ def factorize(A: Float[Array, "m m"], redundant: bool = False) -> Factorization 
     one row of `G` and the span of those before it, and rounding leaves about `eps` of it.
     """
     if redundant:
-        return pseudo_invert(A)
+        return pseudo_invert(A, equilibrated=True)
     m, fixed = A.shape[0], jax.lax.stop_gradient(A)
     if m > UNROLL_LIMIT:
         return _factorize_with_library(A)

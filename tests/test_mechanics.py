@@ -401,13 +401,15 @@ def test_redundant_constraints():
     moving = (y0[0], 0.7 * jnp.stack([jnp.cos(0.9), jnp.sin(0.9), 0.0]))
     a = redundant.accelerations(0.0, moving, args)
     np.testing.assert_allclose(a, reduced.accelerations(0.0, moving, args), rtol=1e-10, atol=1e-10)
-    # multipliers of least norm among all that give these accelerations
+    # of all multipliers that give these accelerations those with the least forces
     multipliers = np.asarray(redundant.multipliers(0.0, moving, args))
     phi = lambda q: redundant.constraint.holonomic(0.0, q, args)
     J = np.asarray(jax.jacobian(phi)(moving[0]))
     assert np.linalg.matrix_rank(J) == 2
-    force = np.array([0.0, -GRAVITY, 0.0]) - np.array([1.0, 1.0, 0.4]) * np.asarray(a)
-    least = np.linalg.lstsq(J.T, force, rcond=1e-10)[0]
+    masses = np.array([1.0, 1.0, 0.4])
+    force = np.array([0.0, -GRAVITY, 0.0]) - masses * np.asarray(a)
+    size = np.sqrt(np.sum(J**2 / masses, axis=1))
+    least = np.linalg.lstsq(J.T / size, force, rcond=1e-10)[0] / size
     np.testing.assert_allclose(multipliers, least, rtol=1e-9, atol=1e-9)
 
 

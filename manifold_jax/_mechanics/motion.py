@@ -14,6 +14,10 @@ from .kinematics import check_mechanical_state, Kinematics
 from .mass import directions_of, Mass
 
 
+# Of one equation among those that may depend on each other, beside the size of its terms.
+_LARGEST_RESIDUAL = 0.05
+
+
 class Motion:
     """Everything at one state: `C a = -bias`, the mass matrix, and `C M^-1 C^T`, factored."""
 
@@ -49,6 +53,8 @@ class Motion:
         valid = self.mass.valid & self.factorization.full_rank
         if isinstance(self.C, AbstractRows):
             valid &= self._satisfied(accelerations, free, force, bias)
+        elif self.redundant:
+            valid &= _agree(self.C, accelerations, bias)
         undefined = jnp.where(valid, 0, jnp.nan).astype(free.dtype)
         return accelerations + undefined, multipliers + undefined
 
@@ -74,6 +80,17 @@ class Motion:
         else:
             factorization = factorize(gram(J, directions), self.redundant)
         return self.w - combine(factorization.solve(rate), directions)
+
+
+def _agree(C: Float[Array, "m n"], a: Float[Array, " n"], bias: Float[Array, " m"]) -> BoolScalar:
+    """Whether `C a = -bias` but for what equations that depend on each other contradict each other at a
+    stage beside the manifold. If not, an independent one was taken for dependent."""
+    C, a, bias = jax.lax.stop_gradient((C, a, bias))
+    sizes = jnp.abs(C)
+    own = sizes @ jnp.abs(a) + jnp.abs(bias)
+    # Where nothing moves, for instance across the plane of a planar mechanism in space.
+    any = jnp.max(sizes, axis=1) * jnp.max(jnp.abs(a)) + jnp.max(jnp.abs(bias))
+    return jnp.all(jnp.abs(C @ a + bias) <= _LARGEST_RESIDUAL * (own + 0.02 * any))
 
 
 def _flat_force(force: Any, q: Y, x: Float[Array, " n"]) -> Float[Array, " n"]:

@@ -60,11 +60,12 @@ class MechanicalSystem(eqx.Module):
     - `stabilization`: [`Baumgarte`][] or [`VelocityStabilization`][]; not needed with
         [`Projected`][] or [`LocalCoordinates`][].
     - `redundant`: constraints may depend on each other (closed loops described twice). The
-        accelerations are those of the independent ones, the multipliers the ones of least
-        norm. Otherwise dependent constraints give an error at the start. What counts as
+        accelerations are those of the independent ones, the multipliers those with the least
+        forces. Otherwise dependent constraints give an error at the start. What counts as
         dependent is decided anew in every evaluation, also beside the manifold: directions in
-        which the equations are a hundred times weaker than in the strongest. Write equations
-        in like units, and keep tolerances below about 1e-3.
+        which the equations, each scaled to a gradient of length one, are a hundred times weaker
+        than in the strongest. Keep tolerances below about 1e-3. Where an independent equation is
+        taken for dependent and not satisfied for it, accelerations are NaN.
     - `structure`: `"sparse"` for many constraints of few coordinates each (chains, trusses,
         molecules), at a cost that grows with their number `m`, not with `m^3`: `J M^-1 J^T`, reordered
         by reverse Cuthill-McKee, is eliminated in blocks of its bandwidth `w`, `m w^2` operations; all
@@ -181,7 +182,8 @@ class MechanicalSystem(eqx.Module):
     def multipliers(self, t: RealScalarLike, y: Y, args: Args = None) -> Float[Array, " m"]:
         """`lambda` of `M a + J^T lambda = Q`: first those of `constraint` in the order of
         `ravel_pytree`, then those of `velocity_constraint`. The constraint force on the
-        coordinates is `-J^T lambda`. With `redundant=True` the solution of least norm."""
+        coordinates is `-J^T lambda`. With `redundant=True` the solution with the least forces, the sum of
+        `lambda_i^2 (J M^-1 J^T)_ii`."""
         motion = Motion(self, t, y, args)
         return motion.solve(motion.bias)[1]
 
