@@ -49,7 +49,8 @@ DEFAULT = {"accurate": {"tsit5"}, "other": set()}
 
 
 def cases(kind):
-    """Pairs of problem and solver, most of them in the slow part."""
+    """Pairs of problem and solver, most of them in the slow part. Solutions with every solver; steps and
+    events, which do not depend on it, with one, but for the problem from outside."""
     return [
         pytest.param(
             name,
@@ -59,7 +60,7 @@ def cases(kind):
             else pytest.mark.slow,
         )
         for name, solver in EVERY
-        if kind == "accurate" or name not in MECHANISMS or solver == "tsit5"
+        if kind == "accurate" or solver == "tsit5" or name == "outside" or (name, solver) in ALSO
     ]
 
 
