@@ -184,7 +184,7 @@ def wheelset() -> BoardProblem:
         10.0,
         end,
         "",
-        rtol=1e-8,
-        atol=1e-10,
+        rtol=1e-9,
+        atol=1e-11,
         form="index-1",
     )

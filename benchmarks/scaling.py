@@ -4,7 +4,7 @@
 
 Projected Tsit5, rtol = atol = 1e-8, the first steps of a folded chain, with constraints as sparse and
 as dense matrices, on one core. Beside them SciPy's DOP853 with banded solves and without corrections,
-and one solve of the whole system for accelerations and multipliers by KLU (`klujax`, if installed).
+MuJoCo (if installed) with its RK4, angles as coordinates and a constant step, and one solve of the whole system for accelerations and multipliers by KLU (`klujax`, if installed).
 """
 
 import time
@@ -163,6 +163,32 @@ def banded(links: int) -> dict[str, Any]:
     )
 
 
+def by_mujoco(links: int) -> list[dict[str, Any]]:
+    """Angles of point masses on hinges: nothing to violate, a dense mass matrix."""
+    try:
+        import mujoco
+    except ImportError:
+        return []
+    spec, y0 = mujoco.MjSpec(), Chain(links, "sparse").y0
+    spec.option.timestep, spec.option.integrator = 1e-3, mujoco.mjtIntegrator.mjINT_RK4
+    spec.compiler.degree, body = False, spec.worldbody
+    for i in range(links):
+        body = body.add_body(pos=[0, 0, -1.0 if i > 0 else 0.0])
+        body.add_joint(type=mujoco.mjtJoint.mjJNT_HINGE, axis=[0, -1, 0])
+        body.explicitinertial, body.ipos, body.mass = True, [0, 0, -1], 1.0
+        body.inertia = [1e-6] * 3
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    d = np.diff(np.asarray(y0[0]).reshape(-1, 2), axis=0, prepend=np.zeros((1, 2)))
+    data.qpos[:] = np.diff(np.arctan2(d[:, 0], -d[:, 1]), prepend=0.0)
+    mujoco.mj_forward(model, data)
+    expected = Chain(links, "sparse").system.accelerations(0.0, y0, Chain(links, "sparse").args)
+    first = data.qacc[0] * np.array([-d[0, 1], d[0, 0]])
+    np.testing.assert_allclose(first, expected[:2], rtol=1e-4, atol=1e-4)
+    ms = fastest(lambda: mujoco.mj_step(model, data, STEPS), 3) / STEPS
+    return [dict(links=links, method="MuJoCo", ms_per_step=ms)]
+
+
 def whole_system(links: int, repeats: int) -> dict[str, Any]:
     """Accelerations: ours, and KLU on `[M J^T; J 0]` with its entries given."""
     chain = Chain(links, "sparse")
@@ -209,15 +235,18 @@ def table(rows: list[dict[str, Any]]) -> Table:
 
 def write_figure(path: Path, rows: list[dict[str, Any]]) -> None:
     figure, (left, right) = plt.subplots(1, 2, figsize=(9, 3.6), layout="constrained")
-    for method, marker in (("sparse", "o"), ("dense", "s"), ("SciPy, banded", "^")):
+    labels = {"SciPy, banded": "SciPy, banded, not corrected", "MuJoCo": "MuJoCo, RK4"}
+    for method, marker in zip(("sparse", "dense", *labels), "os^D", strict=True):
         own = [row for row in rows if row["method"] == method]
-        label = "SciPy, banded, not corrected" if method.startswith("SciPy") else method
+        if not own:
+            continue
+        label = labels.get(method, method)
         left.loglog(
             *zip(*((r["links"], r["ms_per_step"]) for r in own), strict=True),
             marker=marker,
             label=label,
         )
-        if method != "SciPy, banded":
+        if method not in labels:
             right.loglog(
                 *zip(*((r["links"], r["temporary_mb"]) for r in own), strict=True),
                 marker=marker,
@@ -229,7 +258,7 @@ def write_figure(path: Path, rows: list[dict[str, Any]]) -> None:
     for axes, title in ((left, "ms per step"), (right, "temporary memory, MB")):
         axes.set(xlabel="links", title=title)
         axes.grid(alpha=0.3)
-        axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.18), ncols=3, fontsize=8)
+        axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.18), ncols=2, fontsize=8)
     figure.savefig(path, dpi=150)
 
 
@@ -245,13 +274,18 @@ def main(
     rows = [ours(links, "sparse", repeats) for links in SPARSE]
     rows += [ours(links, "dense", min(repeats, 3)) for links in DENSE]
     rows += [banded(links) for links in (10, 100, 1000, 10_000)]
+    rows += [row for links in (10, 100, 1000) for row in by_mujoco(links)]
     rows += [whole_system(links, 4 * repeats) for links in (10, 100, 1000, 10_000)]
     console.print(table(rows))
     slopes = {"sparse": slope(rows, "sparse", 100), "dense": slope(rows, "dense", 32)}
     console.print(f"slopes: {slopes}")
     if json is not None:
         settings = {"tolerance": 1e-8, "steps": STEPS, "gradient_time": GRADIENT_TIME}
-        content = {"environment": environment("klujax"), "settings": settings, "slopes": slopes}
+        content = {
+            "environment": environment("klujax", "mujoco"),
+            "settings": settings,
+            "slopes": slopes,
+        }
         write_json(json, {**content, "rows": rows})
     if plot is not None:
         write_figure(plot, rows)

@@ -169,16 +169,27 @@ def measure_batch(size: int, repeats: int) -> list[BatchRow]:
     rows = []
     for method in ("Rodas5P", "Kvaerno5 (Diffrax)"):
         one = lambda args, method=method: solve(problem, METHODS[method], args)[0]
-        batch, _ = compiled(jax.vmap(one), args)
         single = jax.jit(one)
         loop = lambda single=single: [jax.block_until_ready(single(a)) for a in args]
-        timings = interleaved({"batch": batch, "loop": loop}, repeats)
-        ends, alone = np.asarray(batch()), np.stack(loop())
-        difference = float(np.max(np.abs(ends / alone - 1)))
-        for kind, timing in timings.items():
-            each = Timing(*(value / size for value in dataclasses.astuple(timing)))
+        runs = {"vmap": compiled(jax.vmap(one), args)[0], "loop": loop}
+        if method == "Rodas5P":
+            runs["mj.solve_ensemble"], _ = compiled(in_lanes, args)
+        timings = interleaved(runs, repeats)
+        alone = np.stack(loop())
+        for kind, run in runs.items():
+            difference = float(np.max(np.abs(np.asarray(run()) / alone - 1)))
+            each = Timing(*(value / size for value in dataclasses.astuple(timings[kind])))
             rows.append(BatchRow(f"{method}, {kind}", size, each, difference))
     return rows
+
+
+def in_lanes(args: Any) -> Any:
+    problem = PROBLEMS["Robertson"]
+    starts = jnp.tile(jnp.asarray(problem.y0), (args.shape[0], 1))
+    controller = dfx.PIDController(rtol=problem.rtol, atol=problem.atol)
+    options = dict(stepsize_controller=controller, max_steps=MAX_STEPS)
+    terms, solver = terms_of(problem), METHODS["Rodas5P"]
+    return mj.solve_ensemble(terms, solver, 0.0, problem.t1, 1e-4, starts, args, **options).ys[:, 0]
 
 
 def print_tables(console: Console, rows: list[Row], batch: list[BatchRow]) -> None:

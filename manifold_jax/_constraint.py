@@ -11,9 +11,11 @@ from jaxtyping import Array, Float
 
 from ._correction import equations_of, Normals, solve_correction, without_normal_part
 from ._custom_types import Args, BoolScalar, RealScalarLike, Residual, ResidualFunction, Y
-from ._linear import AbstractRows, multiply
+from ._linear import multiply
 from ._projection import NewtonProjection
 from ._projection_info import ProjectionInfo
+from ._residual import as_time, residual_vector
+from ._sparse import check_choice, Choice, choose_structure, Structure
 from ._user_function import check_function
 
 
@@ -79,7 +81,10 @@ class AbstractConstraint(eqx.Module):
         manifold: the order of solvers and the error estimates rely on it.
         """
         fallback = y if fallback is None else fallback
-        equations = equations_of(self, t, y, args, projection, self.redundant, directions)
+        structure = self.structure_at(t, y, args) if directions is None else None
+        equations = equations_of(
+            self, t, y, args, projection, self.redundant, directions, structure
+        )
         safe = jax.lax.stop_gradient(jfu.ravel_pytree(fallback)[0])
         root = solve_correction(equations, safe, projection, far)
         return jfu.ravel_pytree(y)[1](root.p), ProjectionInfo.of_correction(equations.x, root)
@@ -91,8 +96,9 @@ class AbstractConstraint(eqx.Module):
         `(m, k)`. `k` is `n`, unless components are moved together (positions and velocities)."""
         return equations_of(self, t, y, args, projection, self.redundant).normals()
 
-    def sparse_rows(self, t: RealScalarLike, y: Y, args: Args = None) -> AbstractRows | None:
-        """`G = dg/dy` at `y` without its entries, if there are many equations of few unknowns."""
+    def structure_at(self, t: RealScalarLike, y: Y, args: Args = None) -> Structure | None:
+        """Of `G = dg/dy`, if it is not to be held as an array: for many equations of few unknowns
+        each. Known while tracing."""
         del t, y, args
         return None
 
@@ -137,6 +143,13 @@ class Constraint(AbstractConstraint):
         is decided anew in each correction: a combination of equations, each scaled to a gradient of
         length one, counts as dependent if its gradient is below a hundredth of the largest.
         Corrections then cost an eigenvalue decomposition of an `(m, m)` matrix.
+    - `structure`: `"sparse"` for many equations of few numbers of the state each, at a cost that
+        grows with their number `m`, not with `m^3`: `G W^-1 G^T` is eliminated in blocks, all else
+        are products with `G`, which is never formed. `"dense"` for matrices. `"auto"` takes sparse
+        ones for 32 equations or more if reordering makes it banded enough, as described at
+        [`MechanicalSystem`][]. Which equation depends on which numbers is found from the function
+        itself: indices must be NumPy arrays that it closes over, not be in `args`. Sparse equations
+        must be independent. [`LocalCoordinates`][] forms dense matrices whatever the structure.
 
     Use [`Invariants`][] when the constraint is "this quantity keeps its initial
     value".
@@ -144,13 +157,23 @@ class Constraint(AbstractConstraint):
 
     function: ResidualFunction
     redundant: bool = eqx.field(static=True, default=False, kw_only=True)
+    structure: Choice = eqx.field(static=True, default="auto", kw_only=True)
 
     def __check_init__(self):
+        check_choice(self.structure, self.redundant)
         advice = "Write e.g. `mj.Constraint(lambda t, y, args: y @ y - 1.0)`."
         check_function("function", self.function, "g(t, y, args)", advice=advice)
 
     def __call__(self, t: RealScalarLike, y: Y, args: Args = None) -> Residual:
         return self.function(t, y, args)
+
+    def structure_at(self, t, y, args=None) -> Structure | None:
+        if self.redundant:
+            return None
+        x, unravel = jfu.ravel_pytree(y)
+        t = as_time(t, x.dtype)
+        residual = lambda x: residual_vector(self, t, unravel(x), args)
+        return choose_structure(self.structure, ((residual, x),))
 
 
 class Invariants(AbstractConstraint):

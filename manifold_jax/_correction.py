@@ -19,12 +19,14 @@ from ._linear import (
     combine,
     factorize_once,
     gram,
+    InverseWeights,
     pseudo_invert,
     Rows,
 )
 from ._newton import AbstractEquations, chord, damped_newton, implicit_tangent
 from ._projection import NewtonProjection
 from ._residual import as_time, jacobian, residual_vector, row_scale
+from ._sparse import SparseRows, Structure
 
 
 class Normals(NamedTuple):
@@ -61,7 +63,8 @@ def _dependent(ratio: FloatScalar) -> FloatScalar:
 
 
 class CorrectionEquations(AbstractEquations):
-    """`g(t, x + V z, args) = 0` in the multipliers `z`; `V = W^-1 G(x)^T` unless given."""
+    """`g(t, x + V z, args) = 0` in the multipliers `z`; `V = W^-1 G(x)^T` unless given. With a
+    `structure`, `G` is not held as an array."""
 
     function: Any  # (t, x, args)
     t: Array
@@ -70,6 +73,7 @@ class CorrectionEquations(AbstractEquations):
     inverse_metric: Float[Array, " n"] | None = None
     directions: Rows | None = None
     redundant: bool = eqx.field(static=True, default=False)
+    structure: Structure | None = eqx.field(static=True, default=None)
 
     def residual(self, x: Float[Array, " n"]) -> Float[Array, " m"]:
         return self.function(self.t, x, self.args)
@@ -86,32 +90,38 @@ class CorrectionEquations(AbstractEquations):
         if isinstance(self.directions, AbstractRows):
             rows = self.directions.of_other(self.function, self.t, x, self.args)
             return Crossing.of(Normals(rows, self.directions), self.redundant)
-        G = jacobian(self.residual, x)[1]
+        G = self._rows(x)
         if self.directions is not None:
             return Crossing.of(Normals(G, self.directions), self.redundant)
-        (_, directions), level = self._normals()
+        at_start = self.normals()
         # `G V` of two points, whose dependence differs by the distance between them.
-        dependent = _dependent(1e3 * level) if self.redundant else 0.0
-        return Crossing.of(Normals(G, directions), self.redundant, dependent)
+        dependent = _dependent(1e3 * self.level(at_start)) if self.redundant else 0.0
+        return Crossing.of(Normals(G, at_start.directions), self.redundant, dependent)
 
     def crossing(self) -> Crossing:
         """At the point that is corrected."""
-        normals, level = self._normals()
+        normals = self.normals()
         # Equations that depend on each other on the manifold do so beside it up to the distance.
-        dependent = _dependent(1e6 * level**2) if self.redundant else 0.0
+        dependent = _dependent(1e6 * self.level(normals) ** 2) if self.redundant else 0.0
         return Crossing.of(normals, self.redundant, dependent)
 
     def normals(self) -> Normals:
-        return self._normals()[0]
-
-    def _normals(self) -> tuple[Normals, FloatScalar]:
-        """And how far from the manifold the point is."""
-        r, G = jacobian(self.residual, self.x)
-        level = jnp.max(jnp.abs(r) / row_scale(G, self.x))
+        G = self._rows(self.x)
         if self.directions is not None:
-            return Normals(G, self.directions), level
-        directions = G if self.inverse_metric is None else G * self.inverse_metric[None, :]
-        return Normals(G, directions), level
+            return Normals(G, self.directions)
+        if self.inverse_metric is None:
+            return Normals(G, G)
+        metric = InverseWeights(self.inverse_metric)
+        return Normals(G, G.along(metric) if isinstance(G, SparseRows) else metric.solve(G))
+
+    def _rows(self, x: Float[Array, " n"]) -> Rows:
+        if self.structure is None:
+            return jacobian(self.residual, x)[1]
+        return SparseRows(self.function, self.t, x, self.args, self.structure)
+
+    def level(self, normals: Normals) -> FloatScalar:
+        """How far from the manifold the point is."""
+        return jnp.max(jnp.abs(self.residual(self.x)) / row_scale(normals.jacobian, self.x))
 
     def starting_at(self, x: Float[Array, " n"]) -> "CorrectionEquations":
         return dataclasses.replace(self, x=x)
@@ -220,6 +230,7 @@ def equations_of(
     projection: NewtonProjection,
     redundant: bool,
     directions: Float[Array, "m n"] | None = None,
+    structure: Structure | None = None,
 ) -> CorrectionEquations:
     """Those of the residual `function(t, y, args)` of a whole state."""
     x, unravel = jfu.ravel_pytree(y)
@@ -229,7 +240,7 @@ def equations_of(
         lambda t, x, args: residual_vector(function, t, unravel(x), args), t, x, args
     )
     metric = projection.inverse_metric(y)
-    return CorrectionEquations(residual, t, x, args, metric, directions, redundant)
+    return CorrectionEquations(residual, t, x, args, metric, directions, redundant, structure)
 
 
 def without_normal_part(

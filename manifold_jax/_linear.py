@@ -43,11 +43,20 @@ class AbstractRows(eqx.Module):
     @abc.abstractmethod
     def factorize(self, directions: "AbstractRows", checked: bool = True) -> Any:
         """`C V` with the rows of `V^T`, factored: `solve(b)`, and `full_rank`. That is not known if
-        it is not checked; then look at the residuals of solutions, `solves(residual, size)`."""
+        it is not checked; then look at the residuals of solutions, `solves(residual, size2)`."""
 
     @abc.abstractmethod
     def of_other(self, function: Any, t: Array, x: Float[Array, " n"], args: Any) -> "AbstractRows":
         """Those of `function(t, x, args)` at `x`, of the same structure."""
+
+
+class InverseWeights(eqx.Module):
+    """A diagonal metric, given by its inverse."""
+
+    weights: Float[Array, " n"]
+
+    def solve(self, rows: Float[Array, "*k n"]) -> Float[Array, "*k n"]:
+        return rows * jnp.broadcast_to(self.weights, rows.shape)
 
 
 if TYPE_CHECKING:

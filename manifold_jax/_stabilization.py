@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 
 from ._constraint import AbstractConstraint
-from ._correction import equations_of, solve_correction
+from ._correction import CorrectionEquations, equations_of, solve_correction
 from ._custom_types import Args, RealScalarLike, Y
 from ._linear import combine
 from ._projection import NewtonProjection
@@ -96,7 +96,7 @@ class InvariantStabilization(AbstractStabilization):
         derivative = f(t, y, args)
         w, unravel = jfu.ravel_pytree(derivative)
         # Of the whole state, whatever structure the constraint has: components are not moved apart.
-        equations = equations_of(constraint, t, y, args, projection, constraint.redundant)
+        equations = _equations(constraint, t, y, args, projection)
         x, t = equations.x, equations.t
         crossing = equations.crossing()
         rate = sign * self.gain * equations.residual(x)
@@ -141,7 +141,7 @@ class ExactStabilization(AbstractStabilization):
 
     def field(self, f, constraint, projection, sign, t, y, args):
         # Of the whole state, the nearest point in all components.
-        equations = equations_of(constraint, t, y, args, projection, constraint.redundant)
+        equations = _equations(constraint, t, y, args, projection)
         x, unravel = equations.x, jfu.ravel_pytree(y)[1]
         root = solve_correction(equations, jax.lax.stop_gradient(x), projection, False)
         if not self.ends_on_manifold:
@@ -157,3 +157,10 @@ class ExactStabilization(AbstractStabilization):
             return derivative + sign * self.gain * (p - y) + undefined.astype(p.dtype)
 
         return jtu.tree_map(stabilized, f(t, point, args), point, y)
+
+
+def _equations(constraint, t, y, args, projection) -> CorrectionEquations:
+    structure = constraint.structure_at(t, y, args)
+    return equations_of(
+        constraint, t, y, args, projection, constraint.redundant, structure=structure
+    )

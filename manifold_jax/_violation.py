@@ -4,16 +4,16 @@ from typing import Any
 
 import equinox as eqx
 import jax
-import jax.flatten_util as jfu
 import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array
 
 from ._constraint import AbstractConstraint
 from ._constraint_checks import check_constraint, check_constraint_type, check_state
+from ._correction import equations_of
 from ._custom_types import Args, FloatScalar, Y
 from ._errors import clear_errors
-from ._residual import jacobian, residual_vector, row_scale
+from ._projection import NewtonProjection
 
 
 @clear_errors
@@ -57,8 +57,8 @@ def constraint_violation(
 
 def _violation(constraint: AbstractConstraint, t: Array, y: Y, args: Args) -> FloatScalar:
     check_constraint(constraint, t, y, args)
-    x, unravel = jfu.ravel_pytree(y)
-    residual = lambda x: residual_vector(constraint, t, unravel(x), args)
-    rows = constraint.sparse_rows(t, y, args)
-    r, G = jacobian(residual, x) if rows is None else (residual(x), rows)
-    return jnp.max(jnp.abs(r) / row_scale(G, x))
+    structure = constraint.structure_at(t, y, args)
+    equations = equations_of(
+        constraint, t, y, args, NewtonProjection(), constraint.redundant, structure=structure
+    )
+    return equations.level(equations.normals())

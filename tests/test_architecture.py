@@ -24,7 +24,7 @@ LAYERS = [
         "_user_function",
         "_rejection",
     },
-    {"_linear", "_residual", "_projection", "_stability", "_directed_term", "_scalar"},
+    {"_linear", "_residual", "_projection", "_stability", "_directed_term", "_scalar", "_of_args"},
     {"_incidence"},
     {"_sparse"},
     {"_newton"},

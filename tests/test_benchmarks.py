@@ -29,6 +29,7 @@ SMALLEST = {
     "ensemble": dict(size=4, lanes=2, repeats=1, problems="pendulum", saved=2, pendulums=4),
     "mujoco_peers": dict(),
     "pendulum_peers": dict(repeats=1),
+    "polymer": dict(bonds=6, long=1.0, repeats=1, quick=True),
 }
 QUICK = ("accelerator",)
 

@@ -81,10 +81,18 @@ def refused_as_it_varies(t, x, xdot, a):
     return jnp.stack([into + x[0], -into + x[1]])
 
 
-@pytest.mark.parametrize("F", [refused_only_here, refused_as_it_varies])
-def test_other_cancellations_are_refused(F):
+def refused_only_without_it(t, x, xdot, a):
+    """Cancels where `a` is zero, as in the example."""
+    return jnp.stack([(1 + a) * xdot[0] - xdot[1] + x[0], xdot[1] - xdot[0] + x[1]])
+
+
+@pytest.mark.parametrize(
+    ("F", "a"),
+    [(refused_only_here, 1.0), (refused_as_it_varies, 1.0), (refused_only_without_it, 0.0)],
+)
+def test_other_cancellations_are_refused(F, a):
     with pytest.raises(ValueError, match=r"`F\[0\]`, `F\[1\]` depend on each other"):
-        mj.reduce_dae(F, jnp.ones(2), jnp.asarray(1.0))
+        mj.reduce_dae(F, jnp.ones(2), jnp.asarray(a))
 
 
 # Unknowns that are higher derivatives than any in the other equations

@@ -27,6 +27,7 @@ HOOKS = {
     "stabilized": mj.Stabilized(dfx.Bosh3(), CIRCLE, stabilization=mj.InvariantStabilization(2.0)),
     "charts": mj.LocalCoordinates(dfx.Bosh3(), CIRCLE),
     "plain": dfx.Bosh3(),
+    "stiff": mj.Rodas3P(),
 }
 
 
@@ -67,7 +68,7 @@ def test_each_is_what_it_is_alone(name):
     sol = mj.solve_ensemble(TURN, hook, 0.25, t1s, None, STARTS, RATES, lanes=LANES, **options)
     single = jax.jit(jax.vmap(lambda t1, y, a: alone(hook, 0.25, t1, None, y, a, **options)))
     assert_equal(sol, single(t1s, STARTS, RATES))
-    if name not in ("stabilized", "plain"):
+    if name not in ("stabilized", "plain", "stiff"):
         violation = np.abs(np.sum(np.square(sol.ys), -1) - 1)
         assert violation.max() < 1e-15
     assert sol.failures() == []
@@ -222,6 +223,7 @@ def gradients(hook, saveat, t1s, loss):
         ("projected", dfx.SaveAt(t0=True, ts=jnp.array([0.0, 0.25, 0.5]), t1=True), True),
         pytest.param("stabilized", dfx.SaveAt(t1=True), False, marks=pytest.mark.slow),
         pytest.param("plain", dfx.SaveAt(ts=jnp.array([0.6])), True, marks=pytest.mark.slow),
+        pytest.param("stiff", dfx.SaveAt(ts=jnp.array([0.6])), True, marks=pytest.mark.slow),
         pytest.param(
             "charts",
             dfx.SaveAt(ts=jnp.array([0.1, 0.2, 0.6]), fn=lambda t, y, args: y * args[1]),
@@ -241,115 +243,6 @@ def test_gradients(name, saveat, segments, monkeypatch):
         assert np.abs(a).max() > 1e-3
 
 
-@pytest.mark.slow
-@pytest.mark.slow
-@pytest.mark.slow
-@pytest.mark.slow
-@pytest.mark.slow
-@pytest.mark.slow
-@pytest.mark.slow
-@pytest.mark.slow
-@pytest.mark.slow
-@pytest.mark.slow
-@pytest.mark.slow
-@pytest.mark.slow
-@pytest.mark.slow
-@pytest.mark.slow
-@pytest.mark.slow
-@pytest.mark.slow
-@pytest.mark.slow
-@pytest.mark.slow
-@pytest.mark.slow
-@pytest.mark.slow
-@pytest.mark.slow
-@pytest.mark.slow
-@pytest.mark.slow
-@pytest.mark.slow
-@pytest.mark.slow
-@pytest.mark.slow
-@pytest.mark.slow
-@pytest.mark.slow
-@pytest.mark.slow
-@pytest.mark.slow
-@pytest.mark.slow
-@pytest.mark.slow
-@pytest.mark.slow
-@pytest.mark.slow
-@pytest.mark.slow
-@pytest.mark.slow
-@pytest.mark.slow
-@pytest.mark.slow
-@pytest.mark.slow
-@pytest.mark.slow
-@pytest.mark.slow
-@pytest.mark.slow
-@pytest.mark.slow
-@pytest.mark.slow
-@pytest.mark.slow
-@pytest.mark.slow
-@pytest.mark.slow
-@pytest.mark.slow
-@pytest.mark.slow
-@pytest.mark.slow
-@pytest.mark.slow
-@pytest.mark.slow
-@pytest.mark.slow
-@pytest.mark.slow
-@pytest.mark.slow
-@pytest.mark.slow
-@pytest.mark.slow
-@pytest.mark.slow
-@pytest.mark.slow
-@pytest.mark.slow
-@pytest.mark.slow
-@pytest.mark.slow
-@pytest.mark.slow
-@pytest.mark.slow
-@pytest.mark.slow
-@pytest.mark.slow
-@pytest.mark.slow
-@pytest.mark.slow
-@pytest.mark.slow
-@pytest.mark.slow
-@pytest.mark.slow
-@pytest.mark.slow
-@pytest.mark.slow
-@pytest.mark.slow
-@pytest.mark.slow
-@pytest.mark.slow
-@pytest.mark.slow
-@pytest.mark.slow
-@pytest.mark.slow
-@pytest.mark.slow
-@pytest.mark.slow
-@pytest.mark.slow
-@pytest.mark.slow
-@pytest.mark.slow
-@pytest.mark.slow
-@pytest.mark.slow
-@pytest.mark.slow
-@pytest.mark.slow
-@pytest.mark.slow
-@pytest.mark.slow
-@pytest.mark.slow
-@pytest.mark.slow
-@pytest.mark.slow
-@pytest.mark.slow
-@pytest.mark.slow
-@pytest.mark.slow
-@pytest.mark.slow
-@pytest.mark.slow
-@pytest.mark.slow
-@pytest.mark.slow
-@pytest.mark.slow
-@pytest.mark.slow
-@pytest.mark.slow
-@pytest.mark.slow
-@pytest.mark.slow
-@pytest.mark.slow
-@pytest.mark.slow
-@pytest.mark.slow
-@pytest.mark.slow
 @pytest.mark.slow
 @pytest.mark.usefixtures("only_in_lanes")
 def test_gradient_beside_values_that_have_none():
@@ -418,6 +311,36 @@ def test_implicit_solvers_take_the_ordinary_way(solver):
     assert "Kvaerno3 is not an explicit" in sol.execution
     single = jax.jit(jax.vmap(lambda y, a: alone(solver, 0.0, 0.5, 0.1, y, a, **options)))
     assert_equal(sol, single(STARTS, RATES))
+
+
+@pytest.mark.usefixtures("only_in_lanes")
+def test_stiff_systems_fail_alone():
+    """Where `f` has no value, from some time on or at all."""
+
+    def field(t, y, args):
+        return jnp.stack([-1e3 * (y[0] - jnp.cos(t)), args * jnp.sqrt(2 * args - t) * y[1]])
+
+    rates = jnp.array([0.2, 1.0, 2.0, jnp.nan])
+    starts, options = jnp.array([[0.0, 1.0]] * 4), dict(stepsize_controller=PID, max_steps=500)
+    terms, solver = dfx.ODETerm(field), mj.Rodas3P()
+    sol = mj.solve_ensemble(terms, solver, 0.0, 1.0, None, starts, rates, lanes=LANES, **options)
+    one = lambda y, a: mj.diffeqsolve(terms, solver, 0.0, 1.0, None, y, a, throw=False, **options)
+    singles = jax.vmap(one)(starts, rates)
+    np.testing.assert_allclose(sol.ys, singles.ys, rtol=0, atol=1e-12)
+    steps, expected = sol.stats["num_steps"], singles.stats["num_steps"]
+    np.testing.assert_array_equal(
+        steps[1:], expected[1:]
+    )  # rounding decides how the first one ends
+    assert dict(sol.failures()).keys() == {0, 3}
+    assert np.all(np.isnan(sol.ys[sol.failed]))
+
+
+def test_large_stiff_systems_take_the_ordinary_way():
+    decay = dfx.ODETerm(lambda t, y, args: -args * y)
+    starts, rates = jnp.ones((2, 9)), jnp.array([1.0, 2.0])
+    sol = mj.solve_ensemble(decay, mj.Rodas3P(), 0.0, 1.0, 0.1, starts, rates)
+    assert sol.execution == "mapped over, not in lanes: more than 8 unknowns of a stiff system"
+    np.testing.assert_allclose(sol.ys[:, 0, 0], jnp.exp(-rates), rtol=1e-3)
 
 
 def test_too_many_operations_take_the_ordinary_way(monkeypatch):

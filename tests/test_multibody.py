@@ -170,7 +170,7 @@ def every_joint():
     ]
     robot = mb.Assembly(bodies, joints, forces, gravity=GRAVITY)
     q, v = robot.state()
-    noise = mb.Pose(*(jnp.asarray(rng.normal(size=leaf.shape)) for leaf in q))
+    noise = mb.Pose(rng.normal(size=q.position.shape), rng.normal(size=q.orientation.shape))
     (q, v), _ = mj.project(robot.system.constraint, 0.0, (q, jax.tree.map(jnp.add, v, noise)))
     return robot, (q, v)
 

@@ -148,7 +148,7 @@ def test_a_solve_is_that_of_dense_matrices():
     for_comparison = {}
     for choice in ("dense", "auto"):
         system, problem = chain(40, choice)
-        assert (system.constraint.sparse_rows(0.0, problem.y0, problem.args) is None) == (
+        assert (system.constraint.structure_at(0.0, problem.y0, problem.args) is None) == (
             choice == "dense"
         )
         for_comparison[choice] = mj.diffeqsolve(

@@ -114,7 +114,9 @@ def _jacobians(equations: Equations, there: np.ndarray, point: Point) -> list[np
     def moved(x: Array, k: int) -> Array:
         if not jnp.issubdtype(x.dtype, jnp.floating):
             return x
-        return x * jnp.asarray(1 + 0.1 * k * random.normal(size=x.shape), x.dtype)
+        # Zeros, too: a parameter may be zero in the example only.
+        size = jnp.where(x == 0, 1, x)
+        return x + size * jnp.asarray(0.1 * k * random.normal(size=x.shape), x.dtype)
 
     found = []
     for k in range(_POINTS):

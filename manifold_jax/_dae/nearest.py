@@ -172,6 +172,23 @@ def _damped(equations: AbstractEquations, start: Float[Array, " k"]) -> Iterate:
     return damped_newton(equations, start, r, jnp.ones_like(r), _MAX_STEPS, tolerance)
 
 
+def _polished(equations: AbstractEquations, start: Float[Array, " k"]) -> Float[Array, " k"]:
+    """By Newton's steps as long as each is less than half the one before: currents of 1e-12 solve
+    their equations to rounding beside 1 with half their digits."""
+    equations, start = without_derivative((equations, start))
+
+    def advance(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        z, level, _ = state
+        x = equations.point(z)
+        dz = equations.linearize(x).solve(equations.residual(x))
+        size = jnp.max(jnp.abs(dz) / jnp.maximum(jnp.abs(z), jnp.finfo(z.dtype).tiny))
+        smaller = size < level / 2
+        return jnp.where(smaller, z - dz, z), size, smaller & (size > 0)
+
+    first = start, jnp.asarray(jnp.inf, start.dtype), jnp.asarray(True)
+    return jax.lax.while_loop(lambda state: state[2], advance, first)[0]
+
+
 class _Lifted(AbstractEquations):
     """The equations for the unknowns that became states, `z[where]`, with the others given."""
 
@@ -204,4 +221,5 @@ def with_lifted(system: Reduced, t: Array, z: Float[Array, " n"], args: Args) ->
         return z
     levels = Levels(unlifted.c, layout.structure.c)
     equations = _Lifted(system, t, z, args, levels, tuple(where.tolist()))
-    return equations.point(implicit_root(equations, _damped(equations, z[where]).z))
+    root = _polished(equations, _damped(equations, z[where]).z)
+    return equations.point(implicit_root(equations, root))

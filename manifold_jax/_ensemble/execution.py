@@ -3,9 +3,12 @@
 import dataclasses
 
 import diffrax as dfx
+import jax.numpy as jnp
+import jax.tree_util as jtu
 
 from .._adjoint import StepReplayAdjoint
 from .._directed_term import DirectedTerm
+from .._rosenbrock import AbstractRosenbrock
 from .._scalar import NotScalarError
 from .._solver.base import AbstractManifoldSolver
 from .._solver.explicit import is_unrollable
@@ -13,7 +16,7 @@ from .in_lanes import solve_in_lanes, solve_in_lanes_forwards
 from .mapped import solve_mapped
 from .parts import Inputs
 from .solution import EnsembleSolution
-from .unconstrained import Unconstrained
+from .unconstrained import LARGEST_STIFF, Unconstrained
 
 
 def solve_on_one_device(inputs: Inputs, lanes: int) -> EnsembleSolution:
@@ -44,7 +47,11 @@ def _obstacle(inputs: Inputs) -> str | None:
     one, saveat, solver = batch.one(), equations.saveat, equations.solver
     if not isinstance(equations.terms, dfx.ODETerm | DirectedTerm):
         return f"`terms` are {type(equations.terms).__name__}, not an ODETerm"
-    if not is_unrollable(solver.inner, equations.terms, one.t0, one.t1, one.y0, one.args):
+    if isinstance(solver, Unconstrained) and isinstance(solver.inner, AbstractRosenbrock):
+        size = sum(jnp.size(leaf) for leaf in jtu.tree_leaves(one.y0))
+        if size > LARGEST_STIFF:
+            return f"more than {LARGEST_STIFF} unknowns of a stiff system"
+    elif not is_unrollable(solver.inner, equations.terms, one.t0, one.t1, one.y0, one.args):
         return f"{type(solver.inner).__name__} is not an explicit Runge-Kutta method"
     if type(equations.controller) not in (dfx.PIDController, dfx.ConstantStepSize):
         return f"`stepsize_controller` is {type(equations.controller).__name__}"

@@ -74,10 +74,11 @@ def solve_ensemble(
     - `throw`: raise a `RuntimeError` if any trajectory fails. By default it has a result code, and
         the others are what they are without it.
 
-    Explicit Runge-Kutta methods, in a hook or alone, with constant steps or `diffrax.PIDController` are advanced so. Other
-    solvers, other controllers and systems too large to be written out number by number are solved
-    by `diffeqsolve` under `jax.lax.map` in batches of `lanes`. `execution` of the solution says which
-    way was taken, and why.
+    Explicit Runge-Kutta methods, in a hook or alone, and [`Rodas5P`][] and [`Rodas3P`][] alone for up
+    to eight unknowns, with constant steps or `diffrax.PIDController`, are advanced so. Other solvers,
+    mass matrices, other controllers and systems too large to be written out number by number are
+    solved by `diffeqsolve` under `jax.lax.map` in batches of `lanes`. `execution` of the solution says
+    which way was taken, and why.
 
     **Returns:**
 

@@ -107,7 +107,9 @@ class Equations(eqx.Module):
     def _ready(self, given: Given) -> Ready:
         solver, (t0, t1, y0, args) = self.solver, given
         if isinstance(solver, Unconstrained):
-            return solver.ready(t0, t1, self.dt0, y0, self.saveat)
+            return solver.ready(
+                self.terms, t0, t1, self.dt0, y0, args, self.saveat, self.controller
+            )
         return prepare(
             self.terms,
             solver,

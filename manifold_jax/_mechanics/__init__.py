@@ -1,3 +1,5 @@
 from .constraint import MechanicalConstraint as MechanicalConstraint
+from .kinematics import AbstractPositions as AbstractPositions
+from .mass import InvertedBlocks as InvertedBlocks
 from .stabilization import Baumgarte as Baumgarte, VelocityStabilization as VelocityStabilization
 from .system import MechanicalSystem as MechanicalSystem

@@ -12,11 +12,11 @@ from jaxtyping import Array, Float
 from .._constraint import AbstractConstraint
 from .._correction import Normals, without_normal_part
 from .._custom_types import Args, BoolScalar, RealScalarLike, Y
-from .._linear import AbstractRows, multiply
+from .._linear import multiply
 from .._projection import NewtonProjection
 from .._projection_info import ProjectionInfo
 from .._residual import as_time, residual_vector
-from .._sparse import Choice, SparseRows, structure_of
+from .._sparse import Choice, Structure, structure_of
 from .correction import InverseMetrics, TwoStages
 from .kinematics import Kinematics
 
@@ -65,8 +65,8 @@ class MechanicalConstraint(AbstractConstraint):
         stages = self._stages(projection, t, y, args, None).dense()
         return stages.normals(*stages.equations.flat(y)).normals
 
-    def sparse_rows(self, t, y, args=None) -> AbstractRows | None:
-        return rows_of(self, t, y, args) if self.is_sparse(t, y, args) else None
+    def structure_at(self, t, y, args=None) -> Structure | None:
+        return whole_structure(self, t, y, args) if self.is_sparse(t, y, args) else None
 
     def is_sparse(self, t: RealScalarLike, y: Y, args: Args) -> bool:
         """Whether Jacobians are not held as arrays. Known while tracing."""
@@ -110,12 +110,10 @@ class MechanicalConstraint(AbstractConstraint):
         return TwoStages(equations, t, args, projection, metrics, directions, self.redundant)
 
 
-def rows_of(
+def whole_structure(
     constraint: AbstractConstraint, t: RealScalarLike, y: Y, args: Args
-) -> SparseRows | None:
-    """Those of all equations with respect to the whole state, if they are sparse, too."""
+) -> Structure | None:
+    """Of all equations with respect to the whole state, if they are sparse, too."""
     x, unravel = jfu.ravel_pytree(y)
     t = as_time(t, x.dtype)
-    residual = lambda t, x, args: residual_vector(constraint, t, unravel(x), args)
-    structure = structure_of(((lambda x: residual(t, x, args), x),))
-    return None if structure is None else SparseRows.of(residual, t, x, args, structure)
+    return structure_of(((lambda x: residual_vector(constraint, t, unravel(x), args), x),))

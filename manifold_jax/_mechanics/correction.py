@@ -20,10 +20,11 @@ from jaxtyping import Array, Float
 
 from .._correction import CorrectionEquations, CorrectionRoot, Crossing, Normals, solve_correction
 from .._custom_types import Args, BoolScalar, Y
+from .._linear import InverseWeights
 from .._projection import NewtonProjection
 from .._sparse import SparseRows
 from .kinematics import Kinematics
-from .mass import directions_of, InverseWeights
+from .mass import directions_of
 
 
 class InverseMetrics(NamedTuple):

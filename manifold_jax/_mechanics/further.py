@@ -10,10 +10,10 @@ from jaxtyping import Array, Float
 from .._constraint import AbstractConstraint
 from .._correction import Normals
 from .._custom_types import Args, RealScalarLike, Y
-from .._linear import AbstractRows
 from .._projection import NewtonProjection
 from .._projection_info import ProjectionInfo
-from .constraint import MechanicalConstraint, rows_of
+from .._sparse import Structure
+from .constraint import MechanicalConstraint, whole_structure
 
 
 class ExtendedConstraint(AbstractConstraint):
@@ -53,8 +53,9 @@ class ExtendedConstraint(AbstractConstraint):
     def normals(self, projection, t, y, args=None) -> Normals:
         return self.motion.normals(_projections(projection, y)[0], t, split(y)[0], args)
 
-    def sparse_rows(self, t, y, args=None) -> AbstractRows | None:
-        return rows_of(self, t, y, args) if self.motion.is_sparse(t, split(y)[0], args) else None
+    def structure_at(self, t, y, args=None) -> Structure | None:
+        sparse = self.motion.is_sparse(t, split(y)[0], args)
+        return whole_structure(self, t, y, args) if sparse else None
 
     def push_forward(self, t, y, args, directions: Float[Array, "m k"], vector) -> Y:
         (motion, z), (e, e_z) = split(y), split(vector)

@@ -1,19 +1,32 @@
 """Constraints on positions and on velocities, and the mass matrix, as functions of vectors."""
 
+import abc
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.flatten_util as jfu
 import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, Float
 
-from .._custom_types import Args, Y
+from .._custom_types import Args, RealScalarLike, Y
 from .._linear import AbstractRows, Rows
 from .._residual import jacobian
 from .._sparse import Choice, choose_structure, SparseRows, Structure
-from .mass import factorize_mass, Mass, mass_values
+from .mass import factorize_mass, InvertedBlocks, Mass, mass_values
+
+
+class AbstractPositions(eqx.Module):
+    """Constraints `phi(t, q, args)` that know a shorter way to their Jacobian than differentiating."""
+
+    @abc.abstractmethod
+    def __call__(self, t: RealScalarLike, q: Y, args: Args) -> Any: ...
+
+    @abc.abstractmethod
+    def jacobian(self, t: RealScalarLike, q: Y, args: Args) -> Float[Array, "p k"]:
+        """In the orders of `ravel_pytree` of the residual and of `q`."""
 
 
 class Kinematics(NamedTuple):
@@ -75,7 +88,10 @@ class Kinematics(NamedTuple):
             if self.nonholonomic is None:
                 return SparseRows.of(self.position, t, x, args, structure), p
             return SparseRows.of(self.velocity, t, w, (x, args), structure), p
-        _, J = jacobian(lambda x: self.position(t, x, args), x)
+        if isinstance(self.holonomic, AbstractPositions):
+            J = self.holonomic.jacobian(t, self.unravel(x), args)
+        else:
+            _, J = jacobian(lambda x: self.position(t, x, args), x)
         if self.nonholonomic is None:
             return J, J.shape[0]
         nonholonomic = lambda w: self.velocity(t, w, (x, args))[J.shape[0] :]
@@ -119,12 +135,12 @@ class Kinematics(NamedTuple):
         w: Float[Array, " k"],
         args: Args,
         C: Rows,
-    ) -> Mass:
+    ) -> Mass | InvertedBlocks:
         return factorize_mass(self.mass_values(t, x, w, args), C)
 
     def mass_values(
         self, t: Array, x: Float[Array, " k"], w: Float[Array, " k"], args: Args
-    ) -> Float[Array, "..."]:
+    ) -> Float[Array, "..."] | InvertedBlocks:
         q, v = self.unravel(x), self.unravel(w)
         return mass_values(self.mass_matrix(t, q, v, args), q)
 

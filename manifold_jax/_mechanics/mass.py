@@ -11,7 +11,7 @@ import jax.tree_util as jtu
 from jaxtyping import Array, Float
 
 from .._custom_types import Args, BoolScalar, RealScalarLike, Y
-from .._linear import Factorization, factorize, gram, Rows, UNROLL_LIMIT
+from .._linear import Factorization, factorize, gram, InverseWeights, Rows, UNROLL_LIMIT
 from .._sparse import SparseRows
 
 
@@ -65,23 +65,43 @@ class Mass(eqx.Module):
         return jnp.moveaxis(solved, 0, -2).reshape(rows.shape)
 
 
-class InverseWeights(eqx.Module):
-    """A diagonal metric, given by its inverse."""
+class InvertedBlocks(eqx.Module):
+    """A regular mass matrix of blocks whose inverses are known, where the matrix is expected."""
 
-    weights: Float[Array, " n"]
+    inverse: Float[Array, "b d d"]
+    symmetric: BoolScalar
+    positive: BoolScalar
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        return self.inverse.shape
+
+    @property
+    def augmentation(self) -> None:
+        return None
+
+    @property
+    def valid(self) -> BoolScalar:
+        return self.symmetric & self.positive
 
     def solve(self, rows: Float[Array, "*k n"]) -> Float[Array, "*k n"]:
-        return rows * jnp.broadcast_to(self.weights, rows.shape)
+        """`M^-1` applied to each row."""
+        number, size, _ = self.shape
+        parts = rows.reshape(*rows.shape[:-1], number, 1, size)
+        inverse = self.inverse.reshape(*(1,) * (rows.ndim - 1), number, size, size)
+        return jnp.sum(inverse * parts, axis=-1).reshape(rows.shape)
 
 
-def directions_of(metric: "Mass | InverseWeights", C: Rows) -> Rows:
+def directions_of(metric: "Mass | InvertedBlocks | InverseWeights", C: Rows) -> Rows:
     """The rows of `V^T = C W^-1`."""
     return C.along(metric) if isinstance(C, SparseRows) else metric.solve(C)
 
 
-def mass_values(mass_matrix: Any, q: Y) -> Float[Array, "..."]:
+def mass_values(mass_matrix: Any, q: Y) -> Float[Array, "..."] | InvertedBlocks:
     """What `mass_matrix` returned as a scalar, a diagonal `(n,)`, a matrix `(n, n)` or its blocks
     `(n / d, d, d)`."""
+    if isinstance(mass_matrix, InvertedBlocks):
+        return mass_matrix
     x, _ = jfu.ravel_pytree(q)
     n = x.size
     if eqx.is_array_like(mass_matrix) and _is_blocks(jnp.shape(mass_matrix), n):
@@ -103,7 +123,7 @@ def mass_values(mass_matrix: Any, q: Y) -> Float[Array, "..."]:
     )
 
 
-def factorize_mass(M: Float[Array, "..."], C: Rows) -> Mass:
+def factorize_mass(M: Float[Array, "..."] | InvertedBlocks, C: Rows) -> Mass | InvertedBlocks:
     """Factor `M`, of one of the forms of `mass_values`, under constraints `C a = b`.
 
     A singular matrix is allowed if it is positive definite on the null space of `C`, that is
@@ -112,6 +132,8 @@ def factorize_mass(M: Float[Array, "..."], C: Rows) -> Mass:
     Acta Numerica 14 (2005) 1-137, section 5). It is taken for regular ones, too: to look first
     takes two factorizations in every program.
     """
+    if isinstance(M, InvertedBlocks):
+        return M
     yes = jnp.asarray(True)
     if M.ndim < 2:
         positive = jnp.all(M > 0)
@@ -129,7 +151,7 @@ def _is_blocks(shape: tuple[int, ...], n: int) -> bool:
     return len(shape) == 3 and shape[1] == shape[2] and shape[0] * shape[1] == n
 
 
-def _factorize_blocks(M: Float[Array, "b d d"], C: Rows) -> Mass:
+def _factorize_blocks(M: Float[Array, "b d d"], C: Rows) -> Mass | InvertedBlocks:
     """Each of the blocks, under the constraints that concern its coordinates alone (the unit length
     of a quaternion): a block may be singular in the directions that those exclude."""
     if not isinstance(C, SparseRows):

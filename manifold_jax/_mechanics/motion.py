@@ -11,7 +11,7 @@ from .._custom_types import Args, BoolScalar, RealScalarLike, Y
 from .._linear import AbstractRows, combine, factorize, gram, gram_written_out, multiply
 from .further import split
 from .kinematics import check_mechanical_state, Kinematics
-from .mass import directions_of, Mass
+from .mass import directions_of
 
 
 # Of one equation among those that may depend on each other, beside the size of its terms.
@@ -32,7 +32,7 @@ class Motion:
         self.C, self.num_positions = self.equations.rows(self.t, self.x, self.w, args)
         self.bias = self.equations.acceleration_bias(self.t, self.x, self.w, args)
         self.force = _flat_force(system.force(t, q, v, *further, args), q, self.x)
-        self.mass: Mass = self.equations.mass(self.t, self.x, self.w, args, self.C)
+        self.mass = self.equations.mass(self.t, self.x, self.w, args, self.C)
         self.directions = directions_of(self.mass, self.C)
         self.redundant = system.redundant
         if isinstance(self.C, AbstractRows):
@@ -47,24 +47,20 @@ class Motion:
         if self.mass.augmentation is not None:
             force = force - combine(self.mass.augmentation * bias, self.C)
         free = self.mass.solve(force)
-        multipliers = self.factorization.solve(multiply(self.C, free) + bias)
+        right = multiply(self.C, free) + bias
+        multipliers = self.factorization.solve(right)
         accelerations = free - combine(multipliers, self.directions)
         # Added, not selected: the derivative of a discarded NaN would be NaN.
         valid = self.mass.valid & self.factorization.full_rank
         if isinstance(self.C, AbstractRows):
-            valid &= self._satisfied(accelerations, free, force, bias)
+            # `M` applied to the free accelerations and to those by the constraints.
+            size2 = jnp.abs(jnp.dot(free, force)) + jnp.abs(jnp.dot(multipliers, right))
+            residual = multiply(self.C, accelerations) + bias
+            valid &= self.factorization.solves(residual, size2)  # pyright: ignore[reportAttributeAccessIssue]
         elif self.redundant:
             valid &= _agree(self.C, accelerations, bias)
         undefined = jnp.where(valid, 0, jnp.nan).astype(free.dtype)
         return accelerations + undefined, multipliers + undefined
-
-    def _satisfied(self, accelerations, free, force, bias) -> BoolScalar:
-        """Whether `C a = -bias`, for factorizations of which the rank is not known: a missing entry
-        or dependent equations show in that, unless their accelerations are right nevertheless."""
-        rates = jnp.max(jnp.abs(bias) / self.factorization.lengths)  # pyright: ignore[reportAttributeAccessIssue]
-        size = rates + jnp.sqrt(jnp.max(jnp.abs(free * force)))  # as `M free = force`
-        residual = multiply(self.C, accelerations) + bias
-        return self.factorization.solves(residual, size)  # pyright: ignore[reportAttributeAccessIssue]
 
     def constrained(self, b: Float[Array, " m"]) -> Float[Array, " n"]:
         """The smallest change of the velocities, in the metric of the masses, with `C dv = b`."""

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 from .._constraint import AbstractConstraint
 from .._custom_types import Args, RealScalarLike, Y
 from .._directed_term import DirectedTerm
-from .._sparse import Choice
+from .._sparse import check_choice, Choice
 from .._user_function import check_function
 from .constraint import MechanicalConstraint
 from .further import check_further_rates, ExtendedConstraint
@@ -74,8 +74,8 @@ class MechanicalSystem(eqx.Module):
         depends on which coordinates is found from the function itself, whatever the values: indices
         must be NumPy arrays that it closes over, not be in `args`. Sparse masses are scalars, diagonals
         or blocks, a block may be singular only in directions that constraints on its own coordinates
-        exclude, and constraints may not depend on each other. [`LocalCoordinates`][] and
-        [`Stabilized`][] form dense matrices whatever the structure.
+        exclude, and constraints may not depend on each other. [`LocalCoordinates`][] forms
+        dense matrices whatever the structure.
 
     Where the accelerations are not defined (a mass matrix that is not positive definite or not
     symmetric, dependent constraints) they are NaN: steps that meet them are rejected and the
@@ -109,7 +109,7 @@ class MechanicalSystem(eqx.Module):
     ):
         _check_arguments(constraint, force, velocity_constraint, stabilization, further)
         _check_further(further, further_constraint)
-        _check_structure(structure, redundant)
+        check_choice(structure, redundant)
         own = isinstance(mass_matrix, LagrangianMass | ConfigurationMass)  # of another system
         if callable(mass_matrix) and not own:
             check_function("mass_matrix", mass_matrix, "M(q, args)")
@@ -236,16 +236,6 @@ def _check_arguments(
         raise TypeError(
             "`stabilization` must be `mj.Baumgarte(alpha, beta)` or `mj.VelocityStabilization()`, got "
             f"{type(stabilization).__name__}. Others are arguments of `mj.Stabilized`."
-        )
-
-
-def _check_structure(structure: Any, redundant: bool) -> None:
-    if structure not in ("auto", "dense", "sparse"):
-        raise ValueError(f"`structure` must be 'auto', 'dense' or 'sparse', got {structure!r}.")
-    if structure == "sparse" and redundant:
-        raise ValueError(
-            "`structure='sparse'` needs independent constraints, as its elimination cannot tell which depend on others. "
-            "Remove the dependent ones, or use `structure='dense'` with `redundant=True`."
         )
 
 

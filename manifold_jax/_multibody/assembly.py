@@ -9,12 +9,13 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._custom_types import Args, FloatScalar, RealScalarLike
-from .._mechanics import MechanicalSystem
+from .._mechanics import AbstractPositions, MechanicalSystem
+from .._of_args import AbstractOfArgs
 from .._user_function import check_function
 from . import reading
-from .bodies import Bodies, Body, Frames, in_space, Pose, still
+from .bodies import Bodies, Body, Frames, in_space, Pose
 from .checks import check_vector
-from .equations import group_joints, JointGroup
+from .equations import group_joints, jacobian, JointGroup, residuals
 from .forces import AbstractForce
 from .joints import AbstractJoint
 from .loads import AbstractLoads, add, group_forces
@@ -128,9 +129,13 @@ class Assembly(eqx.Module):
 
     def gaps(self, q: Pose) -> dict[str, Float[Array, " r"]]:
         """Residuals of the joints by name: lengths in metres, cosines of angles."""
-        frames = Frames.of(q, still(q))
-        rows = [(group.attachment.names, group.residual(frames)) for group in self.joints]
-        return {name: row for names, group in rows for name, row in zip(names, group, strict=True)}
+        gaps = residuals(self.joints, q)
+        pairs = [
+            (name, row)
+            for group, rows in zip(self.joints, gaps, strict=True)
+            for name, row in zip(group.attachment.names, rows, strict=True)
+        ]
+        return dict(pairs)
 
     def motion(self, y: tuple[Pose, Pose], name: str) -> reading.Motion:
         """Position, orientation, velocity and angular velocity of a body. `y` may have leading axes,
@@ -158,11 +163,18 @@ class Assembly(eqx.Module):
         return reading.energy(self, y)
 
     def _equations(self, q: Pose) -> tuple[Array, ...]:
-        frames = Frames.of(q, still(q))
-        equations = tuple(group.residual(frames) for group in self.joints)
+        equations = residuals(self.joints, q)
         if self.bodies.planar:
             return equations
         return (*equations, (jnp.sum(q.orientation**2, axis=1) - 1) / 2)
+
+    def _jacobian(self, q: Pose) -> Float[Array, "m n"]:
+        rows = jacobian(self.joints, q)
+        if not self.bodies.planar:
+            p, own = q.orientation, jnp.eye(len(self.names), dtype=rows.dtype)
+            norms = own[:, :, None] * jnp.pad(p, ((0, 0), (3, 0)))[:, None, :]
+            rows = jnp.concatenate([rows, norms])
+        return rows.reshape(rows.shape[0], -1)
 
     def _force(self, t: RealScalarLike, q: Pose, v: Pose, args: Args) -> Pose:
         frames = Frames.of(q, v)
@@ -204,11 +216,11 @@ class _Itself(eqx.Module):
         return self.assembly
 
 
-class _Built(eqx.Module):
-    build: Callable
+class _Built(AbstractOfArgs):
+    function: Callable
 
     def __call__(self, args: Args) -> Assembly:
-        assembly = self.build(args)
+        assembly = self.function(args)
         if not isinstance(assembly, Assembly):
             raise TypeError(
                 f"`build` must return an `mj.multibody.Assembly`, got {type(assembly).__name__}."
@@ -219,15 +231,18 @@ class _Built(eqx.Module):
 class _Mass(eqx.Module):
     source: Callable
 
-    def __call__(self, q: Pose, args: Args) -> Float[Array, "..."]:
+    def __call__(self, q: Pose, args: Args) -> Any:
         return self.source(args).bodies.mass_matrix(q)
 
 
-class _Joints(eqx.Module):
+class _Joints(AbstractPositions):
     source: Callable
 
     def __call__(self, t: RealScalarLike, q: Pose, args: Args) -> tuple[Array, ...]:
         return self.source(args)._equations(q)
+
+    def jacobian(self, t: RealScalarLike, q: Pose, args: Args) -> Float[Array, "m n"]:
+        return self.source(args)._jacobian(q)
 
 
 class _Forces(eqx.Module):

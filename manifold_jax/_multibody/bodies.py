@@ -4,25 +4,47 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from .._mechanics import InvertedBlocks
 from .checks import check_vector, floating, is_concrete, unique_names
-from .rotations import compose, planar_rotation, rates_matrix, rotation_matrix, turn
+from .rotations import compose, inverted, planar_rotation, rates_matrix, rotation_matrix, turn
 
 
 GROUND = "ground"
 
 
-class Pose(NamedTuple):
+class Pose(eqx.Module):
     """Positions of the centres of mass `(N, d)` and orientations of `N` bodies: quaternions, scalar
     first, `(N, 4)` in space, angles `(N,)` in the plane. The coordinates `q` of an assembly; its
-    velocities `v` are their rates, in the same layout."""
+    velocities `v` are their rates, in the same layout.
 
-    position: Float[Array, "*n d"]
-    orientation: Float[Array, "..."]
+    Held as one array `coordinates`, `(N, 7)` or `(N, 3)`, a row for each body: then masses are blocks
+    on the diagonal.
+    """
+
+    coordinates: Float[Array, "*n c"]
+
+    def __init__(self, position: Any, orientation: Any):
+        if np.ndim(orientation) < np.ndim(position):
+            orientation = orientation[..., None]
+        are_numpy = isinstance(position, np.ndarray) and isinstance(orientation, np.ndarray)
+        join = np.concatenate if are_numpy else jnp.concatenate
+        self.coordinates = join([position, orientation], axis=-1)  # pyright: ignore[reportAttributeAccessIssue]
+
+    @property
+    def planar(self) -> bool:
+        return self.coordinates.shape[-1] == 3
+
+    @property
+    def position(self) -> Any:
+        return self.coordinates[..., : 2 if self.planar else 3]
+
+    @property
+    def orientation(self) -> Any:
+        return self.coordinates[..., 2] if self.planar else self.coordinates[..., 3:]
 
 
 class Body(eqx.Module):
@@ -150,25 +172,30 @@ class Bodies(eqx.Module):
             )
         return self.names.index(name)
 
-    def mass_matrix(self, q: Pose) -> Float[Array, "..."]:
-        """A diagonal in the plane; in space `diag(m, 4 G^T I G + 4 c p p^T)`.
+    def mass_matrix(self, q: Pose) -> Any:
+        """A diagonal in the plane; in space blocks `diag(m, 4 G^T I G + 4 c p p^T)`, inverted.
 
         The last term is without effect, as the norm of `p` is constant, and makes the matrix
-        regular: without it no force is needed to stretch a quaternion. `c` is the mean moment.
+        regular: without it no force is needed to stretch a quaternion. `c` is the mean moment. As the
+        rows of `G` and `p` are orthogonal, of length `|p|`, the inverse of such a block is
+        `diag(1/m, (G^T I^-1 G + p p^T / c) / (4 |p|^4))`.
         """
         if self.planar:
-            masses = jnp.repeat(self.mass, 2)
-            return jnp.concatenate([masses, self.inertia])
-        n, p = len(self.names), q.orientation
+            return jnp.stack([self.mass, self.mass, self.inertia], axis=1).reshape(-1)
+        p, inertia = q.orientation, self.inertia
         G = rates_matrix(p)
-        mean = jnp.trace(self.inertia, axis1=1, axis2=2) / 3
-        blocks = compose(jnp.swapaxes(G, 1, 2), compose(self.inertia, G))
-        blocks = 4 * (blocks + mean[:, None, None] * p[:, :, None] * p[:, None, :])
-        own = jnp.eye(n, dtype=p.dtype)[:, None, :, None]
-        turning = (own * blocks[:, :, None, :]).reshape(4 * n, 4 * n)
-        moving = jnp.diag(jnp.repeat(self.mass, 3))
-        none = jnp.zeros((3 * n, 4 * n), p.dtype)
-        return jnp.block([[moving, none], [none.T, turning]])
+        inverse, positive = inverted(inertia)
+        mean = jnp.trace(inertia, axis1=1, axis2=2) / 3
+        turning = compose(jnp.swapaxes(G, 1, 2), compose(inverse, G))
+        turning = turning + p[:, :, None] * p[:, None, :] / mean[:, None, None]
+        turning = turning / (4 * jnp.sum(p * p, axis=1) ** 2)[:, None, None]
+        moving = jnp.eye(3, dtype=p.dtype)[None] / self.mass[:, None, None]
+        blocks = jnp.pad(moving, ((0, 0), (0, 4), (0, 4))) + jnp.pad(
+            turning, ((0, 0), (3, 0), (3, 0))
+        )
+        asymmetry = jnp.max(jnp.abs(inertia - jnp.swapaxes(inertia, 1, 2)))
+        symmetric = asymmetry <= 1e-6 * jnp.max(jnp.abs(inertia))
+        return InvertedBlocks(blocks, symmetric, positive & jnp.all(self.mass > 0))
 
     def gyroscopic(self, q: Pose, v: Pose) -> Float[Array, "..."]:
         """`-8 G(p')^T I G(p) p'` of every quaternion; nothing in the plane."""
@@ -179,9 +206,28 @@ class Bodies(eqx.Module):
         return -8 * jnp.sum(rates * momentum[:, :, None], axis=1)
 
 
+class Placed(NamedTuple):
+    """Where the frames of bodies are in space; those in the plane are turned about the third axis."""
+
+    origin: Float[Array, "*n 3"]
+    rotation: Float[Array, "*n 3 3"]
+
+    @staticmethod
+    def of(q: Pose) -> "Placed":
+        turned = planar_rotation if q.planar else rotation_matrix
+        return Placed(in_space(q.position), turned(q.orientation))
+
+
+def with_ground(q: Pose) -> Float[Array, "n_and_1 c"]:
+    """A row of coordinates for each body and, last, for the ground."""
+    upright = np.zeros((1, q.coordinates.shape[-1]))
+    upright[0, 3:4] = 1  # of a quaternion
+    return jnp.concatenate([q.coordinates, jnp.asarray(upright, q.coordinates.dtype)])
+
+
 class Frames(NamedTuple):
     """Origins, rotations, velocities and angular velocities in space of all bodies and, last, of
-    the ground; those in the plane are turned about the third axis."""
+    the ground."""
 
     origin: Float[Array, "n 3"]
     rotation: Float[Array, "n 3 3"]
@@ -191,22 +237,21 @@ class Frames(NamedTuple):
     @staticmethod
     def of(q: Pose, v: Pose) -> "Frames":
         n = q.position.shape[0]
-        if q.orientation.ndim == 1:
-            rotation = planar_rotation(q.orientation)
+        origin, rotation = Placed.of(q)
+        if q.planar:
             spin = jnp.stack([jnp.zeros(n, v.orientation.dtype)] * 2 + [v.orientation], axis=1)
         else:
-            rotation = rotation_matrix(q.orientation)
             spin = turn(rotation, 2 * turn(rates_matrix(q.orientation), v.orientation))
         ground = jnp.eye(3, dtype=rotation.dtype)[None]
         still = lambda rows: jnp.concatenate([in_space(rows), jnp.zeros((1, 3), rows.dtype)])
         return Frames(
-            still(q.position), jnp.concatenate([rotation, ground]), still(v.position), still(spin)
+            still(origin), jnp.concatenate([rotation, ground]), still(v.position), still(spin)
         )
 
 
-def in_space(rows: Float[Array, "n d"]) -> Float[Array, "n 3"]:
+def in_space(rows: Float[Array, "*n d"]) -> Float[Array, "*n 3"]:
     """Vectors in the plane with a third component of zero."""
-    return jnp.pad(rows, ((0, 0), (0, 3 - rows.shape[1])))
+    return jnp.pad(rows, ((0, 0),) * (rows.ndim - 1) + ((0, 3 - rows.shape[-1]),))
 
 
 def stack(values: Sequence[Any]) -> Array:
@@ -214,7 +259,3 @@ def stack(values: Sequence[Any]) -> Array:
     if all(is_concrete(value) for value in values):
         return jnp.asarray(np.stack([np.asarray(value) for value in values]))
     return jnp.stack([jnp.asarray(value) for value in values])
-
-
-def still(q: Pose) -> Pose:
-    return jax.tree_util.tree_map(jnp.zeros_like, q)

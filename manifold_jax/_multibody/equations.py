@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from . import joints
-from .bodies import Bodies, Frames, in_space, stack
+from .bodies import Bodies, Frames, in_space, Placed, Pose, stack, with_ground
 from .checks import floating, is_concrete, unique_names
 from .rotations import basis, compose, dot, turn, turn_back
 
@@ -116,29 +116,30 @@ WITH_AXIS = {
 
 class Attachment(eqx.Module):
     """Which bodies `k` joints or forces belong to (static: the graph of the mechanism), and their
-    points and frames in those."""
+    points and frames in those, of first and of second bodies."""
 
     names: tuple[str, ...] = eqx.field(static=True)
     bodies: tuple[tuple[int, ...], tuple[int, ...]] = eqx.field(static=True)
-    points: tuple[Float[Array, "k 3"], Float[Array, "k 3"]]
-    axes: tuple[Float[Array, "k 3 3"], Float[Array, "k 3 3"]]
+    points: Float[Array, "2 k 3"]
+    axes: Float[Array, "2 k 3 3"]
+
+    @property
+    def index(self) -> np.ndarray:
+        return np.asarray(self.bodies)
 
     def sides(self, frames: Frames) -> Sides:
-        at, axes = [], []
-        for side in (0, 1):
-            index = np.asarray(self.bodies[side])
-            rotation = frames.rotation[index]
-            at.append(frames.origin[index] + turn(rotation, self.points[side]))
-            axes.append(compose(rotation, self.axes[side]))
-        return Sides(*at, *axes)
+        return self.sides_of(Placed(frames.origin[self.index], frames.rotation[self.index]))
+
+    def sides_of(self, placed: Placed) -> Sides:
+        """With the frames of the bodies to which they belong, `(2, k, ...)`."""
+        at = placed.origin + turn(placed.rotation, self.points)
+        axes = compose(placed.rotation, self.axes)
+        return Sides(at[0], at[1], axes[0], axes[1])
 
     def velocities(self, frames: Frames, sides: Sides) -> Float[Array, "k 3"]:
         """Of the second points against the first."""
-        moving = []
-        for index, point in zip(self.bodies, sides[:2], strict=True):
-            index = np.asarray(index)
-            arm = point - frames.origin[index]
-            moving.append(frames.velocity[index] + jnp.cross(frames.spin[index], arm))
+        arms = jnp.stack([sides.first, sides.second]) - frames.origin[self.index]
+        moving = frames.velocity[self.index] + jnp.cross(frames.spin[self.index], arms)
         return moving[1] - moving[0]
 
 
@@ -158,7 +159,7 @@ def attach(bodies: Bodies, things: list[Any], names: list[str], axes: list[Any])
         points.append(jnp.where(is_drawn, in_body, given))
         drawn = basis(stack([floating(pair[side]) for pair in axes]))
         local.append(compose(jnp.swapaxes(rotation, 1, 2), drawn))
-    return Attachment(tuple(names), (first, second), tuple(points), tuple(local))
+    return Attachment(tuple(names), (first, second), jnp.stack(points), jnp.stack(local))
 
 
 def ends(bodies: Bodies, thing: Any, first: int, name: str) -> tuple[bool, Any, Any]:
@@ -208,9 +209,58 @@ class JointGroup(eqx.Module):
                 )
         return JointGroup(kind, planar, attachment, stack(given))
 
-    def residual(self, frames: Frames) -> Float[Array, "k r"]:
-        equations = (PLANAR if self.planar else SPATIAL)[self.kind]
-        return equations(self.attachment.sides(frames), self.length)
+    def residual(self, placed: Placed) -> Float[Array, "k r"]:
+        """`placed` are the bodies of the joints, `(2, k, ...)`."""
+        return self.equations(self.attachment.sides_of(placed), self.length)
+
+    @property
+    def equations(self) -> Callable:
+        return (PLANAR if self.planar else SPATIAL)[self.kind]
+
+
+def residuals(groups: tuple[JointGroup, ...], q: Pose) -> tuple[Float[Array, "k r"], ...]:
+    """Of all joints, kind by kind."""
+    return _residuals(groups, with_ground(q)[_index(groups)], q.planar)
+
+
+def jacobian(groups: tuple[JointGroup, ...], q: Pose) -> Float[Array, "r n c"]:
+    """Derivatives of all equations of joints with respect to the coordinates of the bodies, of which
+    each joint depends on two: one derivative for each coordinate of these, all joints at once."""
+    index, rows = _index(groups), with_ground(q)
+    number, size = rows.shape
+    here = rows[index]
+    along = lambda seed: jax.jvp(
+        lambda here: _residuals(groups, here, q.planar),
+        (here,),
+        (jnp.broadcast_to(seed[:, None, :], here.shape),),
+    )[1]
+    seeds = jnp.eye(2 * size, dtype=here.dtype).reshape(2 * size, 2, size)
+    slopes = jax.vmap(along)(seeds)
+    entries = [jnp.moveaxis(slope.reshape(2, size, -1), 1, 2) for slope in slopes]
+    counts = [slope.shape[2] for slope in slopes]
+    per_joint = np.repeat(counts, [len(group.attachment.names) for group in groups])
+    bodies = np.repeat(index, per_joint, axis=1)
+    equations = np.arange(bodies.shape[1])[None, :]
+    whole = jnp.zeros((bodies.shape[1], number, size), here.dtype)
+    whole = whole.at[equations, bodies].set(jnp.concatenate(entries, axis=1), unique_indices=True)
+    return whole[:, :-1]
+
+
+def _residuals(groups: tuple[JointGroup, ...], here: Float[Array, "2 k c"], planar: bool) -> Any:
+    """From the coordinates of the bodies of all joints."""
+    d = 2 if planar else 3
+    placed = Placed.of(Pose(here[..., :d], here[..., 2] if planar else here[..., 3:]))
+    found, start = [], 0
+    for group in groups:
+        own = slice(start, start := start + len(group.attachment.names))
+        found.append(group.residual(Placed(placed.origin[:, own], placed.rotation[:, own])))
+    return tuple(found)
+
+
+def _index(groups: tuple[JointGroup, ...]) -> np.ndarray:
+    """First and second bodies of all joints, `(2, K)`."""
+    none = np.zeros((2, 0), int)
+    return np.concatenate([none, *(group.attachment.index for group in groups)], axis=1)
 
 
 def group_joints(bodies: Bodies, given: Any) -> tuple[JointGroup, ...]:
@@ -248,13 +298,12 @@ def reactions(
     """Forces and torques on the second bodies at the second points: `-lambda` times the change of
     the equations when that body is moved or turned."""
     sides = group.attachment.sides(frames)
-    equations = (PLANAR if group.planar else SPATIAL)[group.kind]
 
     def moved(shift: Float[Array, "k 3"], angle: Float[Array, "k 3"]) -> Float[Array, "k r"]:
         """About the second point, to first order."""
         axes = sides.frame_second
         turned = axes + jnp.cross(angle[:, :, None], axes, axis=1)
-        return equations(
+        return group.equations(
             sides._replace(second=sides.second + shift, frame_second=turned), group.length
         )
 

@@ -1,7 +1,6 @@
 """What forces do to the bodies, all of one kind in one array computation."""
 
 import abc
-from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -231,8 +230,7 @@ def _in_joints(
     found = [
         _find_joint(groups, thing.joint, name) for thing, name in zip(things, names, strict=True)
     ]
-    pick = lambda part, side: stack([getattr(g.attachment, part)[side][i] for g, i in found])
-    both: Callable = lambda part: tuple(pick(part, side) for side in (0, 1))
+    both = lambda part: jnp.stack([getattr(g.attachment, part)[:, i] for g, i in found], axis=1)
     index = tuple(tuple(g.attachment.bodies[side][i] for g, i in found) for side in (0, 1))
     attachment = Attachment(tuple(names), index, both("points"), both("axes"))  # pyright: ignore[reportArgumentType]
     numbers = _numbers(things, names, "stiffness", "rest", "damping")

@@ -117,7 +117,7 @@ def joint_forces(
     frames, planar = Frames.of(*y), assembly.bodies.planar
     found, start = {}, 0
     for group in assembly.joints:
-        k, r = group.residual(frames).shape
+        k, r = group.equations(group.attachment.sides(frames), group.length).shape
         own = multipliers[start : start + k * r].reshape(k, r)
         start += k * r
         for name, force, torque in zip(

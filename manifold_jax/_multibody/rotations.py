@@ -6,7 +6,10 @@ Source: Haug, Computer Aided Kinematics and Dynamics of Mechanical Systems (1989
 from typing import Any
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
+
+from .._custom_types import BoolScalar
 
 
 def quaternion(axis: Any, angle: Any) -> Float[Array, "4"]:
@@ -40,26 +43,41 @@ def rates_matrix(p: Float[Array, "*n 4"]) -> Float[Array, "*n 3 4"]:
     return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
 
 
-def planar_rotation(angle: Float[Array, " n"]) -> Float[Array, "n 3 3"]:
+def planar_rotation(angle: Float[Array, "*n"]) -> Float[Array, "*n 3 3"]:
     """The turn by an angle about the third axis."""
     c, s, zero, one = jnp.cos(angle), jnp.sin(angle), jnp.zeros_like(angle), jnp.ones_like(angle)
     rows = [[c, -s, zero], [s, c, zero], [zero, zero, one]]
     return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
 
 
-def turn(R: Float[Array, "n i j"], s: Float[Array, "n j"]) -> Float[Array, "n i"]:
+def turn(R: Float[Array, "*n i j"], s: Float[Array, "*n j"]) -> Float[Array, "*n i"]:
     """`R_k s_k`; small products as sums, which fuse."""
-    return jnp.sum(R * s[:, None, :], axis=2)
+    return jnp.sum(R * s[..., None, :], axis=-1)
 
 
-def turn_back(R: Float[Array, "n i j"], s: Float[Array, "n i"]) -> Float[Array, "n j"]:
+def turn_back(R: Float[Array, "*n i j"], s: Float[Array, "*n i"]) -> Float[Array, "*n j"]:
     """`R_k^T s_k`."""
-    return jnp.sum(R * s[:, :, None], axis=1)
+    return jnp.sum(R * s[..., :, None], axis=-2)
 
 
-def compose(R: Float[Array, "n i j"], S: Float[Array, "n j k"]) -> Float[Array, "n i k"]:
+def compose(R: Float[Array, "*n i j"], S: Float[Array, "*n j k"]) -> Float[Array, "*n i k"]:
     """`R_k S_k`."""
-    return jnp.sum(R[:, :, :, None] * S[:, None, :, :], axis=2)
+    return jnp.sum(R[..., :, :, None] * S[..., None, :, :], axis=-2)
+
+
+def inverted(A: Float[Array, "n 3 3"]) -> tuple[Float[Array, "n 3 3"], BoolScalar]:
+    """The inverses of symmetric matrices by their cofactors, and whether all are positive definite."""
+    next, last = np.array([1, 2, 0]), np.array([2, 0, 1])
+    part = lambda i, j: A[:, i[:, None], j[None, :]]
+    cofactors = part(next, next) * part(last, last) - part(next, last) * part(last, next)
+    determinant = jnp.sum(A[:, 0] * cofactors[:, 0], axis=1)
+    # the leading minors beside the size of their terms
+    diagonal, tiny = jnp.diagonal(A, axis1=1, axis2=2), 100 * jnp.finfo(A.dtype).eps
+    second = cofactors[:, 2, 2] > tiny * diagonal[:, 0] * diagonal[:, 1]
+    positive = jnp.all(diagonal > 0, axis=1) & second
+    positive &= determinant > tiny * jnp.prod(diagonal, axis=1)
+    safe = jnp.where(positive, determinant, 1)
+    return cofactors / safe[:, None, None], jnp.all(positive)
 
 
 def dot(a: Float[Array, "n i"], b: Float[Array, "n i"]) -> Float[Array, " n"]:

@@ -5,4 +5,5 @@ from .solver import (
     AbstractRosenbrock as AbstractRosenbrock,
     Rodas3P as Rodas3P,
     Rodas5P as Rodas5P,
+    RosenbrockState as RosenbrockState,
 )

@@ -77,9 +77,11 @@ class PivotedFactorization(eqx.Module):
         )
 
 
-def factorize_pivoted(A: Float[Array, "n n"]) -> PivotedFactorization:
+def factorize_pivoted(
+    A: Float[Array, "n n"], largest_written_out: int = LARGEST_WRITTEN_OUT
+) -> PivotedFactorization:
     n, eye = A.shape[0], jnp.eye(A.shape[0], dtype=A.dtype)
-    held, regular = (_eliminate if n <= LARGEST_WRITTEN_OUT else _lapack)(jax.lax.stop_gradient(A))
+    held, regular = (_eliminate if n <= largest_written_out else _lapack)(jax.lax.stop_gradient(A))
     return PivotedFactorization(jnp.where(regular, A, eye), held, regular)
 
 

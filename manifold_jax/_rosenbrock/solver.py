@@ -16,6 +16,7 @@ from .._constraint_checks import check_state
 from .._custom_types import Args, BoolScalar, FloatScalar, RealScalarLike, Y
 from .._rejection import is_repeatable, rejecting
 from .algebraic import is_consistent
+from .elimination import LARGEST_WRITTEN_OUT
 from .interpolation import RosenbrockInterpolation
 from .stages import rosenbrock_step
 from .system import mass_matrix_term, System
@@ -37,6 +38,7 @@ class AbstractRosenbrock(dfx.AbstractAdaptiveSolver):
 
     tableau: eqx.AbstractClassVar[RosenbrockTableau]
     checks_start: eqx.AbstractVar[bool]  # not where the state has been made consistent before
+    largest_written_out: eqx.AbstractVar[int]  # number of rows that LAPACK does not factor
 
     term_structure: ClassVar = dfx.AbstractTerm
     interpolation_cls: ClassVar[Callable[..., RosenbrockInterpolation]] = RosenbrockInterpolation
@@ -77,7 +79,7 @@ class AbstractRosenbrock(dfx.AbstractAdaptiveSolver):
         system = System.of(terms, t0, t1, y0, args)
         x0, unravel = jfu.ravel_pytree(y0)
         derivative = system.refreshed(made_jump, solver_state.derivative, x0)
-        step = rosenbrock_step(self.tableau, system, x0, derivative)
+        step = rosenbrock_step(self.tableau, system, x0, derivative, self.largest_written_out)
         finite = jnp.all(jnp.isfinite(step.x1)) & jnp.all(jnp.isfinite(step.error))
         result = RESULTS.where(finite, RESULTS.successful, RESULTS.nonfinite)  # pyright: ignore[reportArgumentType]
         singular = step.defined & ~step.regular | ~solver_state.usable
@@ -128,6 +130,7 @@ class Rodas5P(AbstractRosenbrock):
 
     tableau: ClassVar[RosenbrockTableau] = RODAS5P
     checks_start: bool = True
+    largest_written_out: int = eqx.field(default=LARGEST_WRITTEN_OUT, static=True)
 
 
 class Rodas3P(AbstractRosenbrock):
@@ -143,6 +146,7 @@ class Rodas3P(AbstractRosenbrock):
 
     tableau: ClassVar[RosenbrockTableau] = RODAS3P
     checks_start: bool = True
+    largest_written_out: int = eqx.field(default=LARGEST_WRITTEN_OUT, static=True)
 
 
 def _check_terms(terms: Any) -> None:

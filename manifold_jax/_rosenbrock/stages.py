@@ -25,7 +25,11 @@ class RosenbrockStep(NamedTuple):
 
 
 def rosenbrock_step(
-    tableau: RosenbrockTableau, system: System, x0: Vector, derivative: Vector | None
+    tableau: RosenbrockTableau,
+    system: System,
+    x0: Vector,
+    derivative: Vector | None,
+    largest_written_out: int,
 ) -> RosenbrockStep:
     r"""One step. If `M` depends on time or state, the method is that for the larger system
     $y' = z$, $0 = f(t, y) - M(t, y) z$, with $z$ eliminated from its linear systems: with $Z_i$ for
@@ -41,7 +45,7 @@ def rosenbrock_step(
     Z0 = None if derivative is None else h * derivative
     f0, J, T = system.linearized(x0, Z0)
     M0 = system.mass_at(system.t0, x0)
-    factor = factorize_pivoted(_iteration_matrix(M0, tableau.gamma, J))
+    factor = factorize_pivoted(_iteration_matrix(M0, tableau.gamma, J), largest_written_out)
     U: list[Vector] = []
     V: list[Vector] = []
     known = {((), 0.0): (f0, M0)}

@@ -8,6 +8,7 @@ import equinox as eqx
 from .._adjoint import LocatingAdjoint, StepReplayAdjoint
 from .._custom_types import Args, RealScalarLike, Y
 from .._errors import clear_errors
+from .._of_args import evaluated
 from .._solver.base import AbstractManifoldSolver
 from .arguments import check_arguments, raise_if_unstable
 from .finish import finish
@@ -119,9 +120,11 @@ def diffeqsolve(
             solver_state=solver_state,
             **options,
         )
+    given = solver
+    terms, inside = evaluated((terms, solver), args)
     bends_interpolant = event is not None  # every interpolated value is corrected otherwise
     hook: AbstractManifoldSolver = trusting(
-        solver.within(stepsize_controller, bends_interpolant), consistent
+        inside.within(stepsize_controller, bends_interpolant), consistent
     )
     ready = prepare(
         terms, hook, t0, t1, dt0, y0, args, saveat, stepsize_controller, consistent, throw
@@ -140,4 +143,5 @@ def diffeqsolve(
         solver_state=ready.solver_state if solver_state is None else solver_state,
         **options,
     )
-    return finish(sol, hook, saveat, event, ready.y0, args, ready.start, throw)
+    # The dense solution, which is handed out, holds the constraint that was given.
+    return finish(sol, hook, given, saveat, event, ready.y0, args, ready.start, throw)

@@ -15,6 +15,7 @@ from .start import StartInfo
 def finish(
     sol: dfx.Solution,
     solver: AbstractManifoldSolver,
+    given: AbstractManifoldSolver,
     saveat: dfx.SaveAt,
     event: dfx.Event | None,
     y0: Y,
@@ -23,9 +24,9 @@ def finish(
     throw: bool,
 ) -> dfx.Solution:
     """Correct what was saved, and report; with `throw` raise what went wrong. `saveat` is what was
-    asked for, and `sol.solver_state` has to be there."""
+    asked for, `given` the solver that the user passed, and `sol.solver_state` has to be there."""
     statistics = sol.solver_state.statistics  # pyright: ignore[reportOptionalMemberAccess]
-    sol = _corrected(sol, solver, saveat, event, y0, args, start)
+    sol = _corrected(sol, solver, given, saveat, event, y0, args, start)
     if not throw:
         return sol
     faults = fault_messages(sol.result, solver, statistics, sol.stats["num_accepted_steps"])
@@ -36,6 +37,7 @@ def finish(
 def _corrected(
     sol: dfx.Solution,
     solver: AbstractManifoldSolver,
+    given: AbstractManifoldSolver,
     saveat: dfx.SaveAt,
     event: dfx.Event | None,
     y0: Y,
@@ -54,7 +56,7 @@ def _corrected(
     if interpolation is not None and solver.corrects_output:
         interpolation = ManifoldInterpolation.build(
             interpolation,
-            solver.constraint,
+            given.constraint,
             solver.projection,
             sol.t0,  # pyright: ignore[reportArgumentType]
             y0,

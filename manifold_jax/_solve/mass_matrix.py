@@ -1,5 +1,6 @@
 """The initial value of `M y' = f`: corrected, checked, or trusted, as for a manifold."""
 
+import dataclasses
 from typing import Any
 
 import jax.numpy as jnp
@@ -37,7 +38,7 @@ def trusting(solver: Any, consistent: Consistent) -> Any:
     if consistent != "assume":
         return solver
     return jtu.tree_map(
-        lambda s: type(s)(checks_start=False) if is_rosenbrock(s) else s,
+        lambda s: dataclasses.replace(s, checks_start=False) if is_rosenbrock(s) else s,
         solver,
         is_leaf=is_rosenbrock,
     )

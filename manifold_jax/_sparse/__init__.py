@@ -3,6 +3,7 @@ the elimination of block tridiagonal matrices."""
 
 from .rows import SparseRows as SparseRows
 from .structure import (
+    check_choice as check_choice,
     Choice as Choice,
     choose_structure as choose_structure,
     Structure as Structure,

@@ -57,10 +57,20 @@ class Structure:
         return 3 * -(-self.num_equations // (3 * self.width))
 
 
+def check_choice(structure: Any, redundant: bool) -> None:
+    if structure not in ("auto", "dense", "sparse"):
+        raise ValueError(f"`structure` must be 'auto', 'dense' or 'sparse', got {structure!r}.")
+    if structure == "sparse" and redundant:
+        raise ValueError(
+            "`structure='sparse'` needs independent constraints, as its elimination cannot tell which depend on others. "
+            "Remove the dependent ones, or use `structure='dense'` with `redundant=True`."
+        )
+
+
 def choose_structure(
     choice: Choice,
     equations: tuple[tuple[Callable, Float[Array, " n"]], ...],
-    mass_shape: tuple[int, ...],
+    mass_shape: tuple[int, ...] = (),
 ) -> Structure | None:
     """`None` for dense matrices. `equations` are functions of one vector each, of the same length,
     whose numbers have the masses."""

@@ -2,23 +2,28 @@
 
 Every function builds a [`Problem`][]; its docstring has the equations, the source of
 every number and the digits to trust. `ALL` has those that take seconds to compile: not the
-delta robot and the Stewart platform.
+delta robot and the Stewart platform, nor those that are there to be large (`polymer`, `cable_net`,
+`falling_truss`, `n_four_bar`).
 """
 
 from collections.abc import Callable
 
 from ._problem import Problem as Problem
+from .cable_net import cable_net as cable_net
 from .car_axis import car_axis as car_axis
 from .chain import chain as chain, double_pendulum as double_pendulum
 from .delta_robot import delta_robot as delta_robot
+from .falling_truss import falling_truss as falling_truss
 from .four_bar import four_bar as four_bar
 from .heavy_top import heavy_top as heavy_top
 from .kepler import kepler as kepler
 from .lotka_volterra import lotka_volterra as lotka_volterra
 from .matrix_flows import rotation as rotation, sphere_flow as sphere_flow
+from .n_four_bar import n_four_bar as n_four_bar
 from .oscillator import harmonic_oscillator as harmonic_oscillator
 from .parallelogram import parallelogram as parallelogram
 from .pendulum import pendulum as pendulum
+from .polymer import polymer as polymer
 from .rigid_body import rigid_body as rigid_body
 from .rolling_disc import rolling_disc as rolling_disc
 from .slider_crank import slider_crank as slider_crank

@@ -1,0 +1,89 @@
+"""Point masses on rigid rods: their reference solution, and velocities that the rods allow."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+import scipy.linalg
+import scipy.sparse as sp
+from scipy.sparse.csgraph import reverse_cuthill_mckee
+
+from ._reduced import integrate
+
+
+class Rods(NamedTuple):
+    """Rods between the points `start[i]` and `end[i]`, and `A = J M^-1 J^T` of their equations
+    `|d_i|^2 / 2 = const.`, a banded matrix: `A[i, j] = weight d_i . d_j` for each of the pairs."""
+
+    start: np.ndarray
+    end: np.ndarray
+    inverse_masses: np.ndarray  # of the points; 0 of fixed ones
+    i: np.ndarray
+    j: np.ndarray
+    weight: np.ndarray
+
+    @staticmethod
+    def between(start: np.ndarray, end: np.ndarray, inverse_masses: np.ndarray) -> "Rods":
+        number, points = start.size, inverse_masses.size
+        where = np.tile(np.arange(number), 2), np.concatenate([start, end])
+        signs = np.repeat([-1.0, 1.0], number)
+        touches = sp.csr_matrix((signs, where), (number, points))
+        order = reverse_cuthill_mckee(sp.csr_matrix(abs(touches) @ abs(touches).T))
+        touches = touches[order]
+        pairs = sp.coo_matrix(sp.tril(touches @ sp.diags(inverse_masses) @ touches.T))
+        return Rods(start[order], end[order], inverse_masses, pairs.row, pairs.col, pairs.data)
+
+    def vectors(self, points: np.ndarray) -> np.ndarray:
+        return points[self.end] - points[self.start]
+
+    def solve(self, d: np.ndarray, b: np.ndarray) -> np.ndarray:
+        """`A^-1 b` at vectors `d` along the rods."""
+        entries = self.weight * np.einsum("kd,kd->k", d[self.i], d[self.j])
+        bands = np.zeros((int((self.i - self.j).max()) + 1, len(d)))
+        bands[self.i - self.j, self.j] = entries
+        return scipy.linalg.solveh_banded(bands, b, lower=True, check_finite=False)
+
+    def along(self, d: np.ndarray, b: np.ndarray) -> np.ndarray:
+        """`M^-1 J^T A^-1 b`: the smallest velocities, in the metric of the masses, of which each rod
+        gets `d . d' = b`."""
+        pull = self.solve(d, b)[:, None] * d
+        rates = np.zeros((self.inverse_masses.size, d.shape[1]))
+        np.add.at(rates, self.end, pull)
+        np.subtract.at(rates, self.start, pull)
+        return self.inverse_masses[:, None] * rates
+
+
+def allowed(rods: Rods, q: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """The velocities nearest to `v` with rods of constant length."""
+    d = rods.vectors(q)
+    return v - rods.along(d, np.einsum("kd,kd->k", d, rods.vectors(v)))
+
+
+def rod_field(
+    rods: Rods, force: Callable[[np.ndarray], np.ndarray], dimensions: int
+) -> Callable[[float, np.ndarray], np.ndarray]:
+    """`x' = field(t, x)` of positions and velocities, one after the other, under forces `force(q)`."""
+    shape = rods.inverse_masses.size, dimensions
+
+    def field(_: float, x: np.ndarray) -> np.ndarray:
+        q, v = x.reshape(2, *shape)
+        d, rate = rods.vectors(q), rods.vectors(v)
+        free = rods.inverse_masses[:, None] * force(q)
+        right = np.einsum("kd,kd->k", d, rods.vectors(free)) + np.einsum("kd,kd->k", rate, rate)
+        return np.concatenate([v, free - rods.along(d, right)]).reshape(-1)
+
+    return field
+
+
+def solve_rods(
+    rods: Rods,
+    force: Callable[[np.ndarray], np.ndarray],
+    t: np.ndarray,
+    q: np.ndarray,
+    v: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Positions and velocities at times `t`, from those at time 0, of shape `(points, d)`. Nothing is
+    projected: rods keep their lengths to the accuracy of the integration."""
+    x0 = np.concatenate([q, v]).reshape(-1)
+    states = integrate(rod_field(rods, force, q.shape[1]), x0, t).reshape(t.size, 2, *q.shape)
+    return states[:, 0], states[:, 1]
