@@ -32,10 +32,12 @@ def test_every_public_name_is_documented_once(documented):
     assert sorted(documented) == sorted(public_names())
 
 
-def test_every_notebook_is_a_page():
+def test_every_page_and_every_notebook_is_in_the_navigation():
     navigation = (ROOT / "docs" / "mkdocs.yml").read_text()
-    for path in (ROOT / "notebooks").glob("*.ipynb"):
-        assert f"- notebooks/{path.name}\n" in navigation
+    pages = [path.relative_to(PAGES).as_posix() for path in PAGES.rglob("*.md")]
+    notebooks = [f"notebooks/{path.name}" for path in (ROOT / "notebooks").glob("*.ipynb")]
+    for page in pages + notebooks:
+        assert f" {page}\n" in navigation
 
 
 # The others compile for longer.
