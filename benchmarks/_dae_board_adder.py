@@ -85,7 +85,9 @@ def two_bit_adder() -> BoardProblem:
             "charge": x["charge"] - held,
         }
 
-    start = {"u": ADDER_START, "charge": np.zeros(175)}
+    u0 = jnp.asarray(ADDER_START)
+    charge0 = -residual(0.0, {"u": u0, "charge": 0.0}, {"charge": 0.0}, {"load": 2.0})["charge"]
+    start = {"u": ADDER_START, "charge": np.asarray(charge0)}
     end = np.full(175, np.nan)
     end[outputs] = [0.2040419147264534, 0.4997238455712048e1, 0.2038985905095614]
     return BoardProblem(
@@ -100,4 +102,5 @@ def two_bit_adder() -> BoardProblem:
         floor=1.0,
         jumps=tuple(np.arange(5.0, 320.0, 5.0)),
         short=5.0,
+        form="index-1",
     )

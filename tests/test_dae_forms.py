@@ -70,15 +70,45 @@ def test_combinations_of_a_circuit():
     )
 
 
+@pytest.mark.parametrize("pairs", [1, 2])
+def test_combination_of_varying_coefficients(pairs):
+    """A capacitance that depends on its voltage: `exp(u) (u' - v')` is added and subtracted, so
+    `u + v = 0` and `u' = -u exp(-u) / 2`; two pairs need two combinations."""
+
+    def charged(t, x, xdot, a):
+        u, v = x
+        into = jnp.exp(a * u) * (xdot[0] - xdot[1])
+        return jnp.stack([into + u, -into + v])
+
+    dae = mj.reduce_dae(charged, jnp.ones((2, pairs)), jnp.asarray(1.0))
+    assert (dae.report.index, dae.report.degrees_of_freedom) == (1, pairs)
+    a, z = (
+        jnp.asarray(0.8),
+        dae.consistent_state(0.0, jnp.full((2, pairs), 0.3), jnp.asarray(0.8))[0],
+    )
+    u, v = dae.outputs(0.0, z, a)[0]
+    np.testing.assert_allclose(v, -u, rtol=1e-15)
+    rates = dae.outputs(0.0, z, a)[1]
+    np.testing.assert_allclose(rates[0], -u * jnp.exp(-a * u) / 2, rtol=1e-13)
+
+
 def refused_only_here(t, x, xdot, a):
     """Cancels for `a = 1`, not for other parameters."""
     return jnp.stack([a * (xdot[0] - xdot[1]) + x[0], xdot[1] - xdot[0] + x[1]])
 
 
-def refused_as_it_varies(t, x, xdot, a):
-    """The coefficient that cancels is a function of the state."""
+def refused_as_it_has_no_gradient(t, x, xdot, a):
+    """What cancels comes out of a loop."""
+    once = lambda s: (s[0] + 1, 1.1 * s[1])
     into = jnp.exp(x[0]) * (xdot[0] - xdot[1])
+    into = jax.lax.while_loop(lambda s: s[0] < 2, once, (0, into))[1]
     return jnp.stack([into + x[0], -into + x[1]])
+
+
+def refused_as_it_varies(t, x, xdot, a):
+    """It cancels at one time only."""
+    into = xdot[0] - xdot[1]
+    return jnp.stack([into * jnp.cos(t) + x[0], -into + x[1]])
 
 
 def refused_only_without_it(t, x, xdot, a):
@@ -88,7 +118,12 @@ def refused_only_without_it(t, x, xdot, a):
 
 @pytest.mark.parametrize(
     ("F", "a"),
-    [(refused_only_here, 1.0), (refused_as_it_varies, 1.0), (refused_only_without_it, 0.0)],
+    [
+        (refused_only_here, 1.0),
+        (refused_as_it_varies, 1.0),
+        (refused_as_it_has_no_gradient, 1.0),
+        (refused_only_without_it, 0.0),
+    ],
 )
 def test_other_cancellations_are_refused(F, a):
     with pytest.raises(ValueError, match=r"`F\[0\]`, `F\[1\]` depend on each other"):

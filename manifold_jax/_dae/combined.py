@@ -3,7 +3,8 @@
     C (u' - v') = i(u),   C (v' - u') = j(v)
 
 are regular to the structure, but not solvable for `u'` and `v'`: their sum `0 = i(u) + j(v)` is an
-equation of the unknowns alone. Found where weights and coefficients are constant, and put in the
+equation of the unknowns alone. Found where weights are constant and coefficients are, too, or are
+added and subtracted as one number (like the charge between two nodes of a circuit), and put in the
 place of one of the equations.
 """
 
@@ -16,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from .._incidence import incidence
 from .aliases import Aliases
 from .equations import Combination, Equations
 from .layout import Layout
@@ -43,16 +45,21 @@ def cancelled(
     layout: Layout,
     matrices: list[np.ndarray],
     point: Point,
-) -> Cancelled | None:
-    """Of equations that are differentiated equally often; `None` if there is no such combination
-    that holds for other parameters and times, too."""
+) -> list[Cancelled]:
+    """Of equations that are differentiated equally often: those that hold for other parameters and
+    times, too, and of which none changes an equation that another one needs."""
     jacobians = _jacobians(equations, occurrence.there, point)
+    found: list[Cancelled] = []
     for weights in _common_null_vectors(matrices):
         (used,) = np.nonzero(weights)
         if len(used) < 2 or len(set(layout.structure.c[used].tolist())) > 1:
             continue
         rows = aliases.rows[used]
-        constant = ~occurrence.varies[rows].any(axis=0)
+        if any(other.combination.row in rows for other in found):
+            continue
+        constant = ~occurrence.varies[rows].any(axis=0) | _constant(
+            equations, rows, weights[used], point
+        )
         gone = constant & _vanishes(jacobians, rows, weights[used])
         leading = aliases.merged(gone[None])[0]
         highest = layout.structure.d - layout.structure.c[used[0]]
@@ -64,8 +71,32 @@ def cancelled(
             continue
         target = int(rows[np.argmax(np.abs(weights[used]))])
         parts = tuple(zip(rows.tolist(), weights[used].tolist(), strict=True))
-        return Cancelled(Combination(target, parts), gone)
-    return None
+        found.append(Cancelled(Combination(target, parts), gone))
+    return found
+
+
+def _constant(
+    equations: Equations, rows: np.ndarray, weights: np.ndarray, point: Point
+) -> np.ndarray:
+    """Which coefficients of the weighted sum do not depend on anything, shape `(levels, n)`. Read
+    off its gradient, where what is added and subtracted meets before it is multiplied."""
+    cotangent = np.zeros(equations.n)
+    cotangent[rows] = weights
+
+    def gradient(t: Array, jets: tuple[Array, ...], args: object) -> Array:
+        along = lambda jets: equations(t, jets, eqx.combine(args, point.fixed_args))
+        _, pullback = jax.vjp(along, jets)
+        return jnp.concatenate(pullback(jnp.asarray(cotangent, jets[0].dtype))[0])
+
+    anything = lambda tree: np.ones(
+        (sum(int(np.size(leaf)) for leaf in jax.tree_util.tree_leaves(tree)), 1), bool
+    )
+    tracked = [(tree, anything(tree)) for tree in (point.t, point.jets, point.args)]
+    try:
+        varies = incidence(gradient, *tracked).depends[:, 0]
+    except (ValueError, NotImplementedError):  # no gradient, as of `while_loop`
+        varies = np.ones(cotangent.size * len(point.jets), bool)
+    return ~varies.reshape(len(point.jets), equations.n)
 
 
 def _vanishes(jacobians: list[np.ndarray], rows: np.ndarray, weights: np.ndarray) -> np.ndarray:

@@ -74,11 +74,12 @@ class Occurrence(NamedTuple):
             unknown_primitives=values.unknown_primitives,
         )
 
-    def without(self, before: "Occurrence", row: int, gone: np.ndarray) -> "Occurrence":
-        """Of equations of which one was replaced: `gone[k, j]` is not in it, the others are those
-        of `before`."""
+    def without(self, before: "Occurrence", gone: dict[int, np.ndarray]) -> "Occurrence":
+        """Of equations of which some were replaced: `gone[row][k, j]` is not in them, the others
+        are those of `before`."""
         there = before.there.copy()
-        there[row] = self.there[row] & ~gone
+        for row, away in gone.items():
+            there[row] = self.there[row] & ~away
         return self._replace(there=there)
 
 

@@ -170,7 +170,7 @@ class _Analysis(NamedTuple):
 def _without_cancellations(found: _Analysis, point: Point) -> _Analysis:
     """With combinations of equations from which derivatives are gone, as long as there are some."""
     while found.samples.singular:
-        repair = cancelled(
+        repairs = cancelled(
             found.equations,
             found.occurrence,
             found.aliases,
@@ -178,11 +178,13 @@ def _without_cancellations(found: _Analysis, point: Point) -> _Analysis:
             found.samples.matrices,
             point,
         )
-        if repair is None:
+        if not repairs:
             return found
-        equations = found.equations.combined(repair.combination)
+        equations = found.equations
+        for repair in repairs:
+            equations = equations.combined(repair.combination)
         occurrence = Occurrence.of(equations, point).without(
-            found.occurrence, repair.combination.row, repair.gone
+            found.occurrence, {repair.combination.row: repair.gone for repair in repairs}
         )
         better = _Analysis.of(equations, occurrence, point, found.implicit)
         if better is None:
