@@ -35,6 +35,7 @@ def transistor_amplifier() -> BoardProblem:
         atol=1e-7,
         floor=1.0,
         short=0.01,
+        short_tolerance=1e-9,
     )
 
 

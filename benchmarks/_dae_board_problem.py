@@ -1,7 +1,7 @@
 """What a problem of the DAE board consists of."""
 
 from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax.tree_util as jtu
 import numpy as np
@@ -15,7 +15,8 @@ class BoardProblem(NamedTuple):
     - `floor`: errors are relative to the published number, or to this where that is larger.
     - `jumps`: times at which a derivative of `F` by time jumps.
     - `parameter`: the number in `args`, a mapping, by which is differentiated; over the time
-      `short`, if that is given. Empty where that takes too long to compile.
+      `short` and with the tolerance `short_tolerance`, if those are given. Empty where that takes
+      too long to compile.
     - `form`: that of the reduction.
     - `for_casadi(casadi)`: the equations as CasADi reduces them, and the start of its integrator.
     """
@@ -33,7 +34,8 @@ class BoardProblem(NamedTuple):
     jumps: tuple[float, ...] = ()
     dt0: float | None = None
     short: float | None = None
-    form: str = "ode"
+    short_tolerance: float | None = None
+    form: Literal["ode", "index-1"] = "ode"
     for_casadi: Callable[..., Any] | None = None
 
     def digits(self, x: Any) -> float:

@@ -86,6 +86,9 @@ class Gradients(NamedTuple):
 def gradients(reduction: Reduction) -> Gradients:
     problem = reduction.problem
     t1 = problem.t1 if problem.short is None else problem.short
+    if problem.short_tolerance is not None:
+        tolerances = dict(rtol=problem.short_tolerance, atol=problem.short_tolerance)
+        reduction = reduction._replace(problem=problem._replace(**tolerances))
     value = problem.args[problem.parameter]
 
     def combination(parameter: Any, **options: Any) -> Any:

@@ -3,8 +3,9 @@
 Seen in Diffrax 0.7.2 and Equinox 0.13.8; each name has a test that fails when it moves.
 """
 
-from typing import Any
+from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax.tree_util as jtu
 from diffrax import AbstractTerm, MultiTerm, RESULTS
 from diffrax._heuristics import (
@@ -14,7 +15,7 @@ from diffrax._heuristics import (
 from diffrax._integrate import (
     loop as diffrax_loop,  # what an adjoint has to run  # noqa: F401
     SaveState as SaveState,  # what has been saved so far
-    State as LoopState,  # what a solve carries from step to step: the type checker knows its fields
+    State as LoopState,  # what a solve carries from step to step
 )
 from diffrax._saveat import save_y as save_y  # marks "save the state itself" in SubSaveAt.fn
 from diffrax._solution import (
@@ -83,6 +84,81 @@ def save_states(state: LoopState) -> list[SaveState]:
     is_save_state = lambda x: isinstance(x, SaveState)
     leaves = jtu.tree_leaves(state.save_state, is_leaf=is_save_state)
     return [leaf for leaf in leaves if is_save_state(leaf)]
+
+
+class Progress(NamedTuple):
+    """How far a solve is: where its next step begins and ends, from what, and how many there were."""
+
+    tprev: Any
+    tnext: Any
+    made_jump: Any
+    y: Any
+    solver_state: Any
+    num_steps: Any
+    num_accepted_steps: Any
+
+    @staticmethod
+    def of(state: LoopState) -> "Progress":
+        return Progress(*(getattr(state, name) for name in Progress._fields))
+
+
+class Ending(NamedTuple):
+    """How a solve ended."""
+
+    event_mask: Any
+    save_state: Any
+    result: RESULTS
+
+    @staticmethod
+    def of(state: LoopState) -> "Ending":
+        return Ending(state.event_mask, state.save_state, state.result)
+
+    def put_into(self, state: LoopState) -> LoopState:
+        return eqx.tree_at(lambda s: (s.event_mask, s.save_state, s.result), state, tuple(self))
+
+
+class LastStep(NamedTuple):
+    """The step in which an event happened, with the conditions behind it."""
+
+    start: Any
+    end: Any
+    dense_info: Any
+    values: Any
+    mask: Any
+
+    @staticmethod
+    def of(state: LoopState) -> "LastStep":
+        times = state.event_tprev, state.event_tnext
+        return LastStep(*times, state.event_dense_info, state.event_values, state.event_mask)
+
+
+class Differentiable(NamedTuple):
+    """What has derivatives of the final state of a loop: not its statistics, and not the state of
+    the step size controller."""
+
+    ts: list[Any]
+    ys: list[Any]
+    dense_ts: Any
+    dense_infos: Any
+    event_dense_info: Any
+    y: Any
+    solver_state: Any
+
+    @staticmethod
+    def of(state: LoopState) -> "Differentiable":
+        saved = save_states(state)
+        dense = state.dense_ts, state.dense_infos, state.event_dense_info
+        rows = [s.ts for s in saved], [s.ys for s in saved]
+        return Differentiable(*rows, *dense, state.y, state.solver_state)
+
+    def put_into(self, state: LoopState) -> LoopState:
+        replaced = lambda where, tree, new: eqx.tree_at(
+            where, tree, new, is_leaf=lambda x: x is None
+        )
+        rows = zip(save_states(state), self.ts, self.ys, strict=True)
+        saved = [replaced(lambda s: (s.ts, s.ys), s, new) for s, *new in rows]
+        parts = lambda s: (s.dense_ts, s.dense_infos, s.event_dense_info, s.y, s.solver_state)
+        return replaced(parts, eqx.tree_at(save_states, state, saved), self[2:])
 
 
 def scan_counts(equation: Any) -> tuple[int, int]:

@@ -48,6 +48,7 @@ WRONG = [
     "mj.diffeqsolve(term, hook, 0.0, 1.0, None, y, consistent='yes')",
     "mj.NewtonProjection(max_steps='many')",
     "mj.solve_ensemble(term, hook, 0.0, 1.0, None)",
+    "mj.reduce_dae(lambda t, x, xdot, args: x, jnp.ones(2), form='index1')",
     "mj.fit(1, 2)",
     "mj.no_such_name",
 ]

@@ -1,9 +1,8 @@
 """The time of an event, found when the solve is over: of several in one step, the first."""
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import diffrax as dfx
-import equinox as eqx
 import jax
 import jax.lax as lax
 import jax.numpy as jnp
@@ -13,8 +12,10 @@ from diffrax import RESULTS
 from jaxtyping import Array, Bool, Float
 
 from .._compat import (
-    LoopState,
+    Ending,
+    LastStep,
     nonlinear_failure,
+    Progress,
     SaveState,
     time_direction,
     unvmap_any,
@@ -43,42 +44,31 @@ class LocatingAdjoint(dfx.AbstractAdjoint):
         )
         names = "t0", "t1", "dt0", "stepsize_controller", "max_steps"
         given |= {name: kwargs[name] for name in names}
-        last_step = _LastStep(event, final_state, args, given)
-        located = last_step.happened & (final_state.num_steps > 0)
-        old = _Ending(final_state.event_mask, final_state.save_state, final_state.result)
+        progress, old = Progress.of(final_state), Ending.of(final_state)
+        last_step = _EventsInStep(event, LastStep.of(final_state), args, given)
+        located = last_step.happened & (progress.num_steps > 0)
         new = lax.cond(
             unvmap_any(located),
-            lambda: _ending(old, final_state.num_accepted_steps, last_step, located, saveat),
+            lambda: _ending(old, progress.num_accepted_steps, last_step, located, saveat),
             lambda: old,
         )
-        parts = lambda s: (s.event_mask, s.save_state, s.result)
-        return eqx.tree_at(parts, final_state, tuple(new)), statistics
+        return new.put_into(final_state), statistics
 
 
-class _Ending(NamedTuple):
-    """The parts of the final state that say how a solve ended."""
-
-    event_mask: Any
-    save_state: Any
-    result: RESULTS
-
-
-class _LastStep:
+class _EventsInStep:
     """The step in which a solve ended, and the events in it."""
 
-    def __init__(self, event: dfx.Event, final_state: LoopState, args: Args, given: dict[str, Any]):
+    def __init__(self, event: dfx.Event, step: LastStep, args: Args, given: dict[str, Any]):
         self.args, self.given, self.root_finder = args, given, event.root_finder
         self.events = jtu.tree_leaves(event.cond_fn, is_leaf=callable)
         self.directions = jtu.tree_leaves(event.direction, is_leaf=lambda x: x is None)
-        self.after = [jnp.asarray(v) for v in jtu.tree_leaves(final_state.event_values)]
-        self.mask = jnp.stack(jtu.tree_leaves(final_state.event_mask))
+        self.after = [jnp.asarray(v) for v in jtu.tree_leaves(step.values)]
+        self.mask = jnp.stack(jtu.tree_leaves(step.mask))
         self.happened = jnp.any(self.mask)
-        self.start: Any = lax.stop_gradient(final_state.event_tprev)
-        self.end: Any = lax.stop_gradient(final_state.event_tnext)
+        self.start = lax.stop_gradient(step.start)
+        self.end = lax.stop_gradient(step.end)
         self.interpolation = given["solver"].interpolation_cls(
-            t0=self.start,
-            t1=self.end,
-            **final_state.event_dense_info,  # pyright: ignore[reportCallIssue]
+            t0=self.start, t1=self.end, **step.dense_info
         )
 
     def first(self) -> tuple[FloatScalar, Bool[Array, " events"], RESULTS]:
@@ -138,12 +128,12 @@ class _LastStep:
 
 
 def _ending(
-    old: _Ending,
+    old: Ending,
     num_accepted: IntScalar,
-    last_step: _LastStep,
+    last_step: _EventsInStep,
     located: BoolScalar,
     saveat: dfx.SaveAt,
-) -> _Ending:
+) -> Ending:
     """How the solve ends with its first event, where there is one."""
     t, first, found = last_step.first()
     y = last_step.interpolation.evaluate(t)
@@ -157,7 +147,7 @@ def _ending(
     is_sub = lambda x: isinstance(x, dfx.SubSaveAt)
     save_state = jtu.tree_map(saved, saveat.subs, old.save_state, is_leaf=is_sub)
     result = RESULTS.where(found == RESULTS.successful, old.result, found)
-    new = _Ending(mask, save_state, result)
+    new = Ending(mask, save_state, result)
     return jtu.tree_map(lambda a, b: jnp.where(located, a, b), new, old)
 
 

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, Float
 
-from .._compat import buffer_at_set, LoopState, MaybeBuffer, unvmap_max, while_loop
+from .._compat import buffer_at_set, MaybeBuffer, Progress, unvmap_max, while_loop
 from .._custom_types import IntScalar
 from .sizes import Sizes
 
@@ -106,15 +106,14 @@ def recording(record: Record, of: Callable[[Any], Any], run: Callable) -> tuple[
         nonlocal written
 
         def step(carry):
-            state: LoopState
             state, record = carry
-            new: LoopState = body_fun(state)
-            accepted = new.num_accepted_steps > state.num_accepted_steps
-            row = [state.tprev, jnp.where(accepted, state.tnext, -jnp.inf)]
+            new, now = body_fun(state), Progress.of(state)
+            accepted = Progress.of(new).num_accepted_steps > now.num_accepted_steps
+            row = [now.tprev, jnp.where(accepted, now.tnext, -jnp.inf)]
             if record.jumps:
-                row.append(jnp.asarray(state.made_jump, state.tprev.dtype))  # pyright: ignore[reportAttributeAccessIssue]
+                row.append(jnp.asarray(now.made_jump, now.tprev.dtype))
             x = record.packing.pack(of(state))
-            return new, record.including(unvmap_max(state.num_steps), jnp.stack(row), x)
+            return new, record.including(unvmap_max(now.num_steps), jnp.stack(row), x)
 
         final, written = while_loop(
             lambda carry: cond_fun(carry[0]),

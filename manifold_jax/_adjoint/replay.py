@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array
 
-from .._compat import LoopState
+from .._compat import LoopState, Progress
 from .._custom_types import Args, RealScalarLike, Y
 from .._projection_info import ProjectionInfo
 from .._solver.advance import HookState
@@ -87,16 +87,17 @@ class Solve(NamedTuple):
 
     @staticmethod
     def of(terms: Any, solver: Any, args: Args, init_state: LoopState, controller: Any) -> "Solve":
-        times = init_state.tprev, init_state.tnext
+        begin = Progress.of(init_state)
         # The step of a solver of Diffrax itself is written out, and then remembers nothing.
-        execution = execution_of(solver, terms, *times, init_state.y, args)
+        execution = execution_of(solver, terms, begin.tprev, begin.tnext, begin.y, args)
         written_out = isinstance(execution, WrittenOut)
-        jumps = may_jump(controller, init_state.made_jump)
-        solver_state = lax.stop_gradient(init_state.solver_state)
+        jumps = may_jump(controller, begin.made_jump)
+        solver_state = lax.stop_gradient(begin.solver_state)
         return Solve(terms, solver, args, solver_state, not written_out, jumps)
 
     def state(self, loop_state: LoopState) -> State:
-        return State(loop_state.y, memory_of(loop_state.solver_state) if self.remembers else None)
+        now = Progress.of(loop_state)
+        return State(now.y, memory_of(now.solver_state) if self.remembers else None)
 
     def attempt(
         self, start: RealScalarLike, end: RealScalarLike, jumped: Any, state: State

@@ -11,6 +11,7 @@ from .._compat import (
     diffrax_loop,
     is_unsafe_sde,
     nondifferentiable,
+    Progress,
     save_states,
     while_loop,
 )
@@ -124,7 +125,7 @@ class StepReplayAdjoint(dfx.AbstractAdjoint):
         record = None
         if max_steps is not None:
             room = max(max_steps, 1), self.checkpoints
-            record = Record.empty(start, init_state.tprev.dtype, *room, solve.jumps)
+            record = Record.empty(start, Progress.of(init_state).tprev.dtype, *room, solve.jumps)
 
         def forward(record):
             if record is None:
@@ -181,7 +182,8 @@ def _forward(perturbed, differentiable, record, remembers):
     state, _ = out
     handed_out = HandedOut.of(state, remembers)
     counts = [(s.ts, s.saveat_ts_index) for s in save_states(state)]
-    last = state.tprev, state.num_steps, state.num_accepted_steps, state.y
+    end = Progress.of(state)
+    last = end.tprev, end.num_steps, end.num_accepted_steps, end.y
     return (out, handed_out), (record, last, counts, handed_out)
 
 

@@ -1,7 +1,7 @@
 """From equations to a vector field on a manifold."""
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, get_args, Literal, NamedTuple, TypeAlias
 
 import jax
 import jax.core
@@ -28,13 +28,16 @@ from .signature import signature, SingularParts, Structure
 from .system import ReducedDAE
 
 
+Form: TypeAlias = Literal["ode", "index-1"]
+
+
 def reduce_dae(
     F: Callable,
     x_example: Y,
     args_example: Args = None,
     *,
     order: int = 1,
-    form: str = "ode",
+    form: Form = "ode",
 ) -> ReducedDAE:
     r"""Reduce a differential-algebraic equation of any index,
 
@@ -99,7 +102,7 @@ def reduce_dae(
 
     Source: J. D. Pryce, A simple structural analysis method for DAEs, BIT 41 (2001) 364-394.
     """
-    if form not in ("ode", "index-1"):
+    if form not in get_args(Form):
         raise ValueError(f"`form` must be 'ode' or 'index-1', got {form!r}.")
     implicit = form == "index-1"
     _check_concrete(x_example, args_example)
