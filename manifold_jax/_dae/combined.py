@@ -22,7 +22,7 @@ from .aliases import Aliases
 from .equations import Combination, Equations
 from .layout import Layout
 from .occurrence import Occurrence, Point
-from .samples import equilibrated, singular_below
+from .samples import singular_below
 
 
 # Of a sum that should be zero, relative to its parts.
@@ -109,15 +109,18 @@ def _vanishes(jacobians: list[np.ndarray], rows: np.ndarray, weights: np.ndarray
 
 
 def _common_null_vectors(matrices: list[np.ndarray]) -> list[np.ndarray]:
-    """With few numbers that are not zero, the largest of them 1."""
-    rows = np.max([np.abs(J).max(axis=1) for J in matrices], axis=0)
-    scale = 1 / np.where(rows > 0, rows, 1)
-    every = equilibrated(np.concatenate([J * scale[:, None] for J in matrices], axis=1))
-    scale = scale / np.maximum(np.abs(every).max(axis=1), 1e-300) if len(every) else scale
-    every = np.concatenate([J * scale[:, None] for J in matrices], axis=1)
-    left, values, _ = np.linalg.svd(every / max(np.abs(every).max(initial=0), 1e-300))
-    values = np.concatenate([values, np.zeros(len(left) - len(values))])
-    null = left[:, values <= singular_below(every.dtype)].T
+    """With few numbers that are not zero, the largest of them 1. Columns of each matrix are scaled
+    for themselves: exponential functions differ by many decades from sample to sample."""
+    every = np.concatenate(matrices, axis=1)
+    scale = np.ones(len(every))
+    for _ in range(3):
+        columns = np.abs(every).max(axis=0)
+        every = every / np.where(columns > 0, columns, 1)
+        rows = np.abs(every).max(axis=1)
+        rows = np.where(rows > 0, rows, 1)
+        every, scale = every / rows[:, None], scale / rows
+    left, values, _ = np.linalg.svd(every)
+    null = left[:, values <= singular_below(every.dtype) * values[0]].T
     found = []
     for k in range(len(null)):  # reduced to echelon form
         column = int(np.argmax(np.abs(null[k])))
