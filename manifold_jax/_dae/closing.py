@@ -3,6 +3,7 @@
 from typing import NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -34,13 +35,19 @@ class Plan(NamedTuple):
     ) -> tuple[Array, ...]:
         return self.layout.jets(z, w, self.order + 1 + differentiations)
 
-    def jets_of_states(self, z: Float[Array, " a"], differentiations: int) -> tuple[Array, ...]:
-        """For equations of states alone. The others, evaluated with them, have to stay finite: for
-        unknowns that are not states the example is taken."""
+    def jets_of_states(
+        self, z: Float[Array, " a"], w: Float[Array, " n"] | None, differentiations: int
+    ) -> tuple[Array, ...]:
+        """For equations of states alone. The others, evaluated with them, have to stay finite, and
+        of moderate size where they cancel: for unknowns that are not states those in `w` are
+        taken, without derivatives, or the example."""
         x, *others = self.jets(z, None, differentiations)
         known = self.layout.jet(0).index
         known = (known >= 0) & (known < self.layout.num_states)
-        return jnp.where(known, x, jnp.asarray(self.example, x.dtype)), *others
+        rest = jnp.asarray(self.example, x.dtype)
+        if w is not None:
+            rest = self.layout.jet(0)(jnp.zeros_like(z), jax.lax.stop_gradient(w))
+        return jnp.where(known, x, rest), *others
 
     def rows_below(self, k: int) -> np.ndarray:
         """Equations that are differentiated more than `k` times: `F^(k)` holds of states alone."""

@@ -52,8 +52,8 @@ class ReducedConstraint(AbstractConstraint):
 
     def __call__(self, t: RealScalarLike, y: Y, args: Args = None) -> Float[Array, " m"]:
         c = self.system.static.plan.layout.structure.c
-        z, _ = self.system.split(y)
-        return hidden_constraints(self.system, t, z, args, np.zeros_like(c), c)
+        z, w = self.system.split(y)
+        return hidden_constraints(self.system, t, z, args, np.zeros_like(c), c, w)
 
     def faults(self, t, y, args=None) -> tuple[tuple[BoolScalar, str], ...]:
         z, w = self.system.split(jfu.ravel_pytree(y)[0])
@@ -62,14 +62,21 @@ class ReducedConstraint(AbstractConstraint):
 
 
 def hidden_constraints(
-    system: Reduced, t: Any, z: Array, args: Args, first: np.ndarray, end: np.ndarray
+    system: Reduced,
+    t: Any,
+    z: Array,
+    args: Args,
+    first: np.ndarray,
+    end: np.ndarray,
+    w: Array | None = None,
 ) -> Float[Array, " m"]:
-    """`F_i^(k)` for `first_i <= k < end_i`."""
+    """`F_i^(k)` for `first_i <= k < end_i`. Leading derivatives `w` like those that belong to `z` are
+    for the size of what cancels."""
     plan, t = system.static.plan, as_time(t, z.dtype)
     rows, order = plan.layout.aliases.rows, int(end.max(initial=0)) - 1
     if order < 0:
         return jnp.zeros((0,), z.dtype)
-    jets = plan.jets_of_states(z, order)
+    jets = plan.jets_of_states(z, w, order)
     levels = total_derivatives(system.equations, t, jets, args, order)
     parts = [pick(levels[k], rows[(first <= k) & (k < end)]) for k in range(order + 1)]
     return jnp.concatenate(parts)

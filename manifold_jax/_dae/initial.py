@@ -128,7 +128,7 @@ def _found(
     fixed = np.array(held, bool)
     given, finite = guess, jnp.all(jnp.isfinite(guess))
     guess = jnp.where(finite, guess, 0)
-    nearest = nearest_state(system, t, guess, fixed, args)
+    nearest = nearest_state(system, t, guess, w, fixed, args)
     z = with_lifted(system, t, nearest.z, args)
     solvable = jnp.asarray(True)
     if system.static.plan.implicit:
@@ -137,7 +137,7 @@ def _found(
     regular = closing.linearize(fixed_w).full_rank
     c = system.static.plan.layout.structure.c
     constraint = lambda z: hidden_constraints(
-        system, closing.t, z, closing.args, np.zeros_like(c), c
+        system, closing.t, z, closing.args, np.zeros_like(c), c, fixed_w
     )
     r, G = jacobian(constraint, closing.z)
     level = jnp.zeros((), guess.dtype)  # there may be no state at all

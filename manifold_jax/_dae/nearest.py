@@ -49,11 +49,14 @@ class Constrained(eqx.Module):
     t: Array
     args: Args
     free: Float[Array, " n"]
+    w: Float[Array, " k"]  # a guess
     levels: Levels = eqx.field(static=True)
 
     def __call__(self, z: Float[Array, " n"]) -> Float[Array, " m"]:
         levels = self.levels
-        return hidden_constraints(self.system, self.t, z, self.args, levels.first, levels.end)
+        return hidden_constraints(
+            self.system, self.t, z, self.args, levels.first, levels.end, self.w
+        )
 
 
 def _stationarity(g: Constrained, guess: Array, x: Float[Array, " k"]) -> Float[Array, " k"]:
@@ -147,7 +150,12 @@ class NearestState(NamedTuple):
 
 
 def nearest_state(
-    system: Reduced, t: Array, guess: Float[Array, " n"], fixed: np.ndarray, args: Args
+    system: Reduced,
+    t: Array,
+    guess: Float[Array, " n"],
+    w: Float[Array, " k"],
+    fixed: np.ndarray,
+    args: Args,
 ) -> "NearestState":
     """Of what holds without the unknowns that became states, which stay where they are."""
     unlifted = system.static.plan.unlifted
@@ -156,7 +164,8 @@ def nearest_state(
         none = jnp.zeros((0,), guess.dtype)
         return NearestState(guess, none, jnp.zeros((), jnp.int32), jnp.asarray(True))
     levels = Levels(np.zeros_like(unlifted.c), unlifted.c)
-    g = Constrained(system, t, args, jnp.asarray(np.where(fixed, 0, 1), guess.dtype), levels)
+    free = jnp.asarray(np.where(fixed, 0, 1), guess.dtype)
+    g = Constrained(system, t, args, free, w, levels)
     near = _approach(g, guess, m)
     root = implicit_root(_Nearest(g, guess), jnp.concatenate([near.z, near.multipliers]))
     settled = near.level <= float(jnp.finfo(guess.dtype).eps) ** 0.5 * (
