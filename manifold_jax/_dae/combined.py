@@ -109,7 +109,7 @@ def _vanishes(jacobians: list[np.ndarray], rows: np.ndarray, weights: np.ndarray
 
 
 def _common_null_vectors(matrices: list[np.ndarray]) -> list[np.ndarray]:
-    """With few numbers that are not zero, the largest of them 1. Columns of each matrix are scaled
+    """With few numbers that are not zero, the first positive, the largest of them 1. Columns of each matrix are scaled
     for themselves: exponential functions differ by many decades from sample to sample."""
     every = np.concatenate(matrices, axis=1)
     scale = np.ones(len(every))
@@ -129,7 +129,7 @@ def _common_null_vectors(matrices: list[np.ndarray]) -> list[np.ndarray]:
         null[others] -= null[others, column][:, None] * null[k][None, :]
     for v in null:
         weights = np.where(np.abs(v) > 1e-9, v, 0) * scale
-        weights = weights / weights[np.argmax(np.abs(weights))]
+        weights = weights / (np.abs(weights).max() * np.sign(weights[np.nonzero(weights)[0][0]]))
         whole = np.rint(weights)
         found.append(np.where(np.abs(weights - whole) < 1e-9, whole, weights))
     return found
