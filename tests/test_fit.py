@@ -255,6 +255,29 @@ def test_what_the_data_do_not_determine_is_named():
     assert not np.any(np.isnan(result.covariance))
 
 
+@pytest.mark.slow
+def test_a_fit_that_diverged_is_returned_without_warnings():
+    """A full step of Gauss and Newton where nothing is left of the motion: the rate overflows."""
+    decay = dfx.ODETerm(lambda t, y, args: -args["rate"] * y)
+    equal = mj.Constraint(lambda t, y, args: y[0] - y[1])
+    ts = np.linspace(0, 1, 11)
+    result = mj.fit(
+        lambda parameters: (decay, equal),
+        {"rate": 40.0},
+        ts,
+        np.exp(-ts)[:, None] * np.ones(2),
+        y0=np.ones(2),
+        sigma=0.01,
+        positive=True,
+        optimizer=optx.GaussNewton(rtol=1e-7, atol=1e-7),
+        throw=False,
+    )
+    assert not result.success
+    assert str(result).startswith("NOT FITTED")
+    assert result.unidentifiable == ("rate",)
+    assert np.isinf(result.standard_errors["rate"])
+
+
 def _product(parameters):
     terms = dfx.ODETerm(lambda t, y, args: 1e3 * args["a"] * args["b"] * jnp.stack([-y[1], y[0]]))
     return terms, CIRCLE

@@ -64,10 +64,14 @@ def describe(
     parameters in their own units (`slopes`: by their unknowns), the largest of them 1."""
     p, size = len(names), np.max(np.abs(direction))
     involved = np.abs(direction[:p]) > 0.05 * size
-    change = direction[:p] * slopes
-    largest = np.argmax(np.abs(change) * involved) if p else 0
-    change = change / change[largest] if np.any(involved) else change
-    parts = [f"{names[i]} ({change[i]:+.3g})" for i in np.flatnonzero(involved)]
+    change = direction[:p] * np.where(involved, slopes, 0.0)
+    largest = change[np.argmax(np.abs(change))] if p else 0.0
+    # A fit that has diverged may be where unknowns change their parameters by nothing, or by infinity.
+    told = largest != 0 and np.isfinite(largest)
+    parts = [
+        f"{names[i]} ({change[i] / largest:+.3g})" if told else str(names[i])
+        for i in np.flatnonzero(involved)
+    ]
     if np.any(np.abs(direction[p:]) > 0.05 * size):
         parts.append("initial states")
     return " with ".join(parts), involved
