@@ -2,6 +2,7 @@
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -24,21 +25,26 @@ class Pivot(NamedTuple):
 
     @staticmethod
     def of(A: Float[Array, "*b w w"]) -> "Pivot":
-        """By halves, `A = [[A, B], [C, D]]`: most of it are products."""
-        half = A.shape[-1] // 2
-        if half == 0:
-            return Pivot(jnp.ones_like(A), 1 / A)
-        first = Pivot.of(A[..., :half, :half])
-        lower = times(A[..., half:, :half], first.right)
-        upper = times(first.left, A[..., :half, half:])
-        second = Pivot.of(A[..., half:, half:] - times(lower, upper))
-        below = -times(second.left, times(lower, first.left))
-        beside = -times(first.right, times(upper, second.right))
-        none = jnp.zeros_like(beside)
-        return Pivot(
-            _joined(first.left, none, below, second.left),
-            _joined(first.right, beside, jnp.swapaxes(none, -1, -2), second.right),
-        )
+        """In the place of `A`: Gauss-Jordan elimination, but for the products of both factors."""
+        width = A.shape[-1]
+        numbers = jnp.arange(width)
+
+        def eliminate(k, P):
+            row, column, pivot = P[..., k, :], P[..., :, k], P[..., k, k, None]
+            here, done = numbers == k, numbers < k
+            upper = row / pivot
+            P = P - jnp.where(
+                done[:, None] & done[None, :], 0, column[..., :, None] * upper[..., None, :]
+            )
+            column = jnp.where(numbers > k, -column / pivot, column)
+            P = jnp.where(here[None, :], column[..., :, None], P)
+            row = jnp.where(numbers > k, -upper, row)
+            return jnp.where(here[:, None], row[..., None, :], P)
+
+        P = jax.lax.fori_loop(0, width, eliminate, A, unroll=width <= _WRITTEN_OUT)
+        diagonal = jnp.diagonal(P, axis1=-2, axis2=-1)[..., None, :]
+        eye = jnp.eye(width, dtype=A.dtype)
+        return Pivot(jnp.tril(P, -1) + eye, (jnp.triu(P, 1) + eye) / diagonal)
 
 
 def times(A: Float[Array, "*b i j"], B: Float[Array, "*b j k"]) -> Float[Array, "*b i k"]:
@@ -54,8 +60,3 @@ def apply(A: Float[Array, "*b w w"], x: Float[Array, "*c w"]) -> Float[Array, "*
     if width > _WRITTEN_OUT:
         return jnp.einsum("...ij,...j->...i", A, x)
     return sum(A[..., :, k] * x[..., None, k] for k in range(width))  # pyright: ignore[reportReturnType]
-
-
-def _joined(A: Array, B: Array, C: Array, D: Array) -> Array:
-    rows = jnp.concatenate([A, B], axis=-1), jnp.concatenate([C, D], axis=-1)
-    return jnp.concatenate(rows, axis=-2)
