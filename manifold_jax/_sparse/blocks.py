@@ -25,8 +25,10 @@ class Pivot(NamedTuple):
 
     @staticmethod
     def of(A: Float[Array, "*b w w"]) -> "Pivot":
-        """In the place of `A`: Gauss-Jordan elimination, but for the products of both factors."""
+        """In the place of `A`, as Gauss-Jordan elimination, which also forms the product."""
         width = A.shape[-1]
+        if width <= _WRITTEN_OUT:
+            return _entry_by_entry(A)
         numbers = jnp.arange(width)
 
         def eliminate(k, P):
@@ -41,10 +43,32 @@ class Pivot(NamedTuple):
             row = jnp.where(numbers > k, -upper, row)
             return jnp.where(here[:, None], row[..., None, :], P)
 
-        P = jax.lax.fori_loop(0, width, eliminate, A, unroll=width <= _WRITTEN_OUT)
+        P = jax.lax.fori_loop(0, width, eliminate, A)
         diagonal = jnp.diagonal(P, axis1=-2, axis2=-1)[..., None, :]
         eye = jnp.eye(width, dtype=A.dtype)
         return Pivot(jnp.tril(P, -1) + eye, (jnp.triu(P, 1) + eye) / diagonal)
+
+
+def _entry_by_entry(A: Float[Array, "*b w w"]) -> Pivot:
+    """The same, so that it fuses: half the time of what is masked."""
+    numbers = range(A.shape[-1])
+    one, zero = jnp.ones_like(A[..., 0, 0]), jnp.zeros_like(A[..., 0, 0])
+    P = [[A[..., i, j] for j in numbers] for i in numbers]
+    for k in numbers:
+        inverse = 1 / P[k][k]
+        upper = [P[k][j] * inverse for j in numbers]
+        for i in numbers:
+            for j in numbers:
+                if (i > k and j != k) or (i < k and j > k):
+                    P[i][j] = P[i][j] - P[i][k] * upper[j]
+        for i in numbers[k + 1 :]:
+            P[i][k], P[k][i] = -P[i][k] * inverse, -upper[i]
+        P[k][k] = inverse
+    left = [[P[i][j] if i > j else one if i == j else zero for j in numbers] for i in numbers]
+    right = [[P[i][j] * P[j][j] if i < j else P[i][i] for j in numbers] for i in numbers]
+    right = [[right[i][j] if i <= j else zero for j in numbers] for i in numbers]
+    stacked = lambda rows: jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
+    return Pivot(stacked(left), stacked(right))
 
 
 def times(A: Float[Array, "*b i j"], B: Float[Array, "*b j k"]) -> Float[Array, "*b i k"]:

@@ -68,12 +68,11 @@ class InOneLoop(eqx.Module):
             multiplier = times(L, right)
             pivot = Pivot.of(D - times(multiplier, upper))
             upper = times(pivot.left, U)
-            kept = pivot, times(pivot.left, multiplier), times(pivot.right, upper)
-            return (pivot.right, upper), kept
+            return (pivot.right, upper), (pivot, multiplier, upper)
 
         nothing = jnp.zeros_like(blocks.diagonal[0])
-        _, factors = jax.lax.scan(step, (nothing, nothing), tuple(blocks))
-        return InOneLoop(*factors)
+        _, (pivots, lower, upper) = jax.lax.scan(step, (nothing, nothing), tuple(blocks))
+        return InOneLoop(pivots, times(pivots.left, lower), times(pivots.right, upper))
 
     def solve(self, r: Float[Array, "b w"]) -> Float[Array, "b w"]:
         nothing = jnp.zeros_like(r[0])
@@ -108,8 +107,7 @@ class InChunks(eqx.Module):
             multiplier = times(L, right)
             pivot = Pivot.of(D - times(multiplier, upper))
             upper, fill = times(pivot.left, U), -times(pivot.left, times(multiplier, fill))
-            kept = pivot, times(pivot.left, multiplier), upper, fill
-            return (pivot.right, upper, fill), kept
+            return (pivot.right, upper, fill), (pivot, multiplier, upper, fill)
 
         nothing, minus = jnp.zeros_like(D[0]), jnp.broadcast_to(-eye, D[0].shape)
         pivot = Pivot.of(D[0])
@@ -121,6 +119,7 @@ class InChunks(eqx.Module):
         multiplier = times(L[-1], right)
         last_diagonal = D[-1] - times(multiplier, upper)
         last_lower = -times(multiplier, fill)
+        lower = times(pivots.left, lower)
         uppers, fills = times(pivots.right, uppers), times(pivots.right, fills)
 
         def outwards(behind, block):
