@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._custom_types import BoolScalar, FloatScalar
-from .._linear import AbstractRows
+from .._rows import AbstractRows
 from .elimination import Blocks, eliminate
 from .structure import Structure
 
