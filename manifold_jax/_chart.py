@@ -24,9 +24,9 @@ from jaxtyping import Array, Float
 
 from ._constraint import AbstractConstraint
 from ._custom_types import Args, RealScalarLike, Y
-from ._linear import combine
 from ._projection import NewtonProjection
 from ._projection_info import ProjectionInfo
+from ._rows import combine
 
 
 class AbstractCoordinates(eqx.Module):

@@ -11,10 +11,10 @@ from jaxtyping import Array, Float
 
 from ._correction import equations_of, Normals, solve_correction, without_normal_part
 from ._custom_types import Args, BoolScalar, RealScalarLike, Residual, ResidualFunction, Y
-from ._linear import multiply
 from ._projection import NewtonProjection
 from ._projection_info import ProjectionInfo
 from ._residual import as_time, residual_vector
+from ._rows import multiply
 from ._sparse import check_choice, Choice, choose_structure, Structure
 from ._user_function import check_function
 

@@ -14,18 +14,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ._custom_types import Args, BoolScalar, FloatScalar, IntScalar, RealScalarLike, Y
-from ._linear import (
-    AbstractRows,
-    combine,
-    factorize_once,
-    gram,
-    InverseWeights,
-    pseudo_invert,
-    Rows,
-)
+from ._linear import factorize_once, gram, pseudo_invert
 from ._newton import AbstractEquations, chord, damped_newton, implicit_tangent
 from ._projection import NewtonProjection
 from ._residual import as_time, jacobian, residual_vector, row_scale
+from ._rows import AbstractRows, combine, InverseWeights, Rows
 from ._sparse import SparseRows, Structure
 
 

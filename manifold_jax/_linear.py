@@ -5,8 +5,7 @@ mechanism and cannot be fused across a batch. Up to `UNROLL_LIMIT` rows the elim
 is therefore written out entry by entry; beyond that the library routine is used.
 """
 
-import abc
-from typing import Any, TYPE_CHECKING, TypeAlias
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -23,46 +22,6 @@ UNROLL_LIMIT = 8
 
 # Columns up to which an elimination with row exchanges is written out.
 _UNROLLED_COLUMNS = 4
-
-
-class AbstractRows(eqx.Module):
-    """Rows `C` of shape `(m, n)` that are not held as an array, for the functions below."""
-
-    @abc.abstractmethod
-    def multiply(self, x: Float[Array, " n"]) -> Float[Array, " m"]:
-        """`C x`."""
-
-    @abc.abstractmethod
-    def combine(self, weights: Float[Array, " m"]) -> Float[Array, " n"]:
-        """`C^T weights`."""
-
-    @abc.abstractmethod
-    def sizes(self, scale: Float[Array, " n"]) -> Float[Array, " m"]:
-        """`max_j |C_ij| scale_j` with positive scales."""
-
-    @abc.abstractmethod
-    def factorize(self, directions: "AbstractRows", checked: bool = True) -> Any:
-        """`C V` with the rows of `V^T`, factored: `solve(b)`, and `full_rank`. That is not known if
-        it is not checked; then look at the residuals of solutions, `solves(residual, size2)`."""
-
-    @abc.abstractmethod
-    def of_other(self, function: Any, t: Array, x: Float[Array, " n"], args: Any) -> "AbstractRows":
-        """Those of `function(t, x, args)` at `x`, of the same structure."""
-
-
-class InverseWeights(eqx.Module):
-    """A diagonal metric, given by its inverse."""
-
-    weights: Float[Array, " n"]
-
-    def solve(self, rows: Float[Array, "*k n"]) -> Float[Array, "*k n"]:
-        return rows * jnp.broadcast_to(self.weights, rows.shape)
-
-
-if TYPE_CHECKING:
-    Rows: TypeAlias = Any  # whoever knows that they are an array uses them as one
-else:
-    Rows: TypeAlias = Float[Array, "_ _"] | AbstractRows
 
 
 class Factorization(eqx.Module):
@@ -260,24 +219,6 @@ def gram_written_out(A: Float[Array, "i n"], B: Float[Array, "k n"]) -> Float[Ar
     if max(*A.shape, B.shape[0]) > UNROLL_LIMIT:
         return gram(A, B)
     return sum(A[:, None, j] * B[None, :, j] for j in range(A.shape[1]))  # pyright: ignore[reportReturnType]
-
-
-def combine(weights: Float[Array, " m"], rows: Rows) -> Float[Array, " n"]:
-    """`sum_i weights_i rows_i`."""
-    if isinstance(rows, AbstractRows):
-        return rows.combine(weights)
-    if rows.shape[0] > UNROLL_LIMIT:
-        return weights @ rows
-    return sum(weights[i] * rows[i] for i in range(rows.shape[0]))  # pyright: ignore[reportReturnType]
-
-
-def multiply(A: Rows, x: Float[Array, " n"]) -> Float[Array, " m"]:
-    """`A x`, not by the library either, whose batched small products are slow."""
-    if isinstance(A, AbstractRows):
-        return A.multiply(x)
-    if A.shape[1] > UNROLL_LIMIT:
-        return gram(A, x[None, :])[:, 0]
-    return combine(x, A.T)
 
 
 class Elimination(eqx.Module):

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ._custom_types import Args, RealScalarLike, ResidualFunction, Y
-from ._linear import AbstractRows, Rows
+from ._rows import AbstractRows, Rows
 
 
 def residual_vector(

@@ -17,8 +17,8 @@ import jax.tree_util as jtu
 from ._constraint import AbstractConstraint
 from ._correction import CorrectionEquations, equations_of, solve_correction
 from ._custom_types import Args, RealScalarLike, Y
-from ._linear import combine
 from ._projection import NewtonProjection
+from ._rows import combine
 from ._stability import refuse_negative
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._custom_types import Args, BoolScalar, FloatScalar, IntScalar
-from .._linear import combine, gram, multiply
+from .._linear import gram
 from .._newton import (
     AbstractEquations,
     damped_newton,
@@ -26,6 +26,7 @@ from .._newton import (
 )
 from .._projection import NewtonProjection
 from .._residual import jacobian
+from .._rows import combine, multiply
 from .constraint import hidden_constraints, Reduced
 from .pivots import Pivoted
 

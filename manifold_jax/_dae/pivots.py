@@ -10,7 +10,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._custom_types import BoolScalar
-from .._linear import Factorization, factorize, gram, multiply, reduction, UNROLL_LIMIT
+from .._linear import Factorization, factorize, gram, reduction, UNROLL_LIMIT
+from .._rows import multiply
 from .compressed import Compressed
 from .picking import pick
 

@@ -12,10 +12,10 @@ from jaxtyping import Array, Float
 from .._constraint import AbstractConstraint
 from .._correction import Normals, without_normal_part
 from .._custom_types import Args, BoolScalar, RealScalarLike, Y
-from .._linear import multiply
 from .._projection import NewtonProjection
 from .._projection_info import ProjectionInfo
 from .._residual import as_time, residual_vector
+from .._rows import multiply
 from .._sparse import Choice, Structure, structure_of
 from .correction import InverseMetrics, TwoStages
 from .kinematics import Kinematics

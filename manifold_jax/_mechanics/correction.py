@@ -20,8 +20,8 @@ from jaxtyping import Array, Float
 
 from .._correction import CorrectionEquations, CorrectionRoot, Crossing, Normals, solve_correction
 from .._custom_types import Args, BoolScalar, Y
-from .._linear import InverseWeights
 from .._projection import NewtonProjection
+from .._rows import InverseWeights
 from .._sparse import SparseRows
 from .kinematics import Kinematics
 from .mass import directions_of

@@ -12,8 +12,8 @@ import jax.tree_util as jtu
 from jaxtyping import Array, Float
 
 from .._custom_types import Args, RealScalarLike, Y
-from .._linear import AbstractRows, Rows
 from .._residual import jacobian
+from .._rows import AbstractRows, Rows
 from .._sparse import Choice, choose_structure, SparseRows, Structure
 from .mass import factorize_mass, InvertedBlocks, Mass, mass_values
 

@@ -11,7 +11,8 @@ import jax.tree_util as jtu
 from jaxtyping import Array, Float
 
 from .._custom_types import Args, BoolScalar, RealScalarLike, Y
-from .._linear import Factorization, factorize, gram, InverseWeights, Rows, UNROLL_LIMIT
+from .._linear import Factorization, factorize, gram, UNROLL_LIMIT
+from .._rows import InverseWeights, Rows
 from .._sparse import SparseRows
 
 

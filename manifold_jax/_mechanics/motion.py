@@ -8,7 +8,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._custom_types import Args, BoolScalar, RealScalarLike, Y
-from .._linear import AbstractRows, combine, factorize, gram, gram_written_out, multiply
+from .._linear import factorize, gram, gram_written_out
+from .._rows import AbstractRows, combine, multiply
 from .further import split
 from .kinematics import check_mechanical_state, Kinematics
 from .mass import directions_of

@@ -9,7 +9,7 @@ import jax.scipy.linalg as jsl
 from jaxtyping import Array, Float
 
 from .._custom_types import BoolScalar, FloatScalar
-from .._linear import combine
+from .._rows import combine
 
 
 # Rows up to which an elimination is written out entry by entry, for XLA to fuse it with the stages. A

@@ -14,8 +14,8 @@ from .._constraint_checks import check_state
 from .._custom_types import Args, RealScalarLike, Y
 from .._diagnosis import Diagnosis
 from .._errors import clear_errors
-from .._linear import multiply
 from .._projection_info import ProjectionInfo
+from .._rows import multiply
 from .._user_function import check_function
 from .algebraic import consistent, Equations, faults_of_start
 

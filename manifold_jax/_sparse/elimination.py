@@ -14,13 +14,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from .blocks import apply, Pivot, times
+
 
 # Blocks in a chunk, and up to which number of blocks there is one loop over all of them.
 _CHUNK = 32
 _ONE_LOOP = 64
-
-# Rows up to which products and inverses are written out, as in `_linear`.
-_WRITTEN_OUT = 4
 
 
 class Blocks(NamedTuple):
@@ -55,39 +54,42 @@ class Tridiagonal(eqx.Module):
 
 
 class InOneLoop(eqx.Module):
-    """One block after the other."""
+    """One block after the other, `x_b = R_b (y_b - W_b x_{b+1})`, `y_b = S_b (r_b - M_b y_{b-1})` with
+    `R_b S_b` the inverse of what is left of `D_b`. Held as `S M` and `R W`, one product for each."""
 
-    multiplier: Float[Array, "b w w"]  # L_b D'_{b-1}^-1
-    inverse: Float[Array, "b w w"]  # D'_b^-1
+    pivots: Pivot
+    lower: Float[Array, "b w w"]
     upper: Float[Array, "b w w"]
 
     @staticmethod
     def of(blocks: Blocks) -> "InOneLoop":
         def step(before, block):
-            (inverse, upper), (L, D, U) = before, block
-            multiplier = _times(L, inverse)
-            inverse = _inverse(D - _times(multiplier, upper))
-            return (inverse, U), (multiplier, inverse)
+            (right, upper), (L, D, U) = before, block
+            multiplier = times(L, right)
+            pivot = Pivot.of(D - times(multiplier, upper))
+            upper = times(pivot.left, U)
+            return (pivot.right, upper), (pivot, multiplier, upper)
 
         nothing = jnp.zeros_like(blocks.diagonal[0])
-        _, (multiplier, inverse) = jax.lax.scan(step, (nothing, nothing), tuple(blocks))
-        return InOneLoop(multiplier, inverse, blocks.upper)
+        _, (pivots, lower, upper) = jax.lax.scan(step, (nothing, nothing), tuple(blocks))
+        return InOneLoop(pivots, times(pivots.left, lower), times(pivots.right, upper))
 
     def solve(self, r: Float[Array, "b w"]) -> Float[Array, "b w"]:
-        reduced = _forwards(self.multiplier, r, jnp.zeros_like(r[0]))
-        upper = _times(self.inverse, self.upper)
-        return _backwards(upper, _apply(self.inverse, reduced), jnp.zeros_like(r[0]))
+        nothing = jnp.zeros_like(r[0])
+        y = _forwards(self.lower, apply(self.pivots.left, r), nothing)
+        return _backwards(self.upper, apply(self.pivots.right, y), nothing)
 
 
 class InChunks(eqx.Module):
-    """`c` chunks of `1 + k` blocks. The `k` inner ones are `x = g - left s_{c-1} - right s_c` with the
+    """`c` chunks of `1 + k` blocks. The `k` inner ones are `x = g - before s_{c-1} - after s_c` with the
     last ones, `s`, of their own chunk and of the one before, and `g` linear in `r`."""
 
-    multiplier: Float[Array, "k c w w"]
-    inverse: Float[Array, "k c w w"]
-    upper: Float[Array, "k c w w"]  # times the inverse
-    left: Float[Array, "k c w w"]
-    right: Float[Array, "k c w w"]
+    pivots: Pivot  # of the inner ones, as `lower` and `upper` in one loop
+    lower: Float[Array, "k c w w"]
+    upper: Float[Array, "k c w w"]
+    before: Float[Array, "k c w w"]
+    after: Float[Array, "k c w w"]
+    last_multiplier: Float[Array, "c w w"]
     last_upper: Float[Array, "c w w"]
     last: "InOneLoop | InChunks"
 
@@ -101,50 +103,48 @@ class InChunks(eqx.Module):
 
         def inwards(before, block):
             """Forwards; `fill` is what couples a block to the last one of the chunk before."""
-            (inverse, upper, fill), (L, D, U) = before, block
-            multiplier = _times(L, inverse)
-            inverse = _inverse(D - _times(multiplier, upper))
-            fill = -_times(multiplier, fill)
-            return (inverse, U, fill), (multiplier, inverse, fill)
+            (right, upper, fill), (L, D, U) = before, block
+            multiplier = times(L, right)
+            pivot = Pivot.of(D - times(multiplier, upper))
+            upper, fill = times(pivot.left, U), -times(pivot.left, times(multiplier, fill))
+            return (pivot.right, upper, fill), (pivot, multiplier, upper, fill)
 
-        first = _inverse(D[0])
-        (inverse, upper, fill), inner = jax.lax.scan(
-            inwards, (first, U[0], L[0]), (L[1:-1], D[1:-1], U[1:-1])
-        )
-        multiplier = _times(L[-1], inverse)
-        last_diagonal = D[-1] - _times(multiplier, upper)
-        last_lower = -_times(multiplier, fill)
-        multipliers = jnp.concatenate([inner[0], multiplier[None]])
-        inverses = jnp.concatenate([first[None], inner[1]])
-        fills = jnp.concatenate([L[0][None], inner[2]])
-        uppers = _times(inverses, U[:-1])
+        nothing, minus = jnp.zeros_like(D[0]), jnp.broadcast_to(-eye, D[0].shape)
+        pivot = Pivot.of(D[0])
+        first = pivot.right, times(pivot.left, U[0]), times(pivot.left, L[0])
+        (right, upper, fill), inner = jax.lax.scan(inwards, first, (L[1:-1], D[1:-1], U[1:-1]))
+        joined = lambda first, rest: jnp.concatenate([first[None], rest])
+        pivots = jax.tree_util.tree_map(joined, pivot, inner[0])
+        lower, uppers, fills = map(joined, (nothing, *first[1:]), inner[1:])
+        multiplier = times(L[-1], right)
+        last_diagonal = D[-1] - times(multiplier, upper)
+        last_lower = -times(multiplier, fill)
+        lower = times(pivots.left, lower)
+        uppers, fills = times(pivots.right, uppers), times(pivots.right, fills)
 
-        def outwards(after, block):
-            (left, right), (upper, fill) = after, block
-            both = fill - _times(upper, left), -_times(upper, right)
+        def outwards(behind, block):
+            (before, after), (upper, fill) = behind, block
+            both = fill - times(upper, before), -times(upper, after)
             return both, both
 
-        minus = jnp.broadcast_to(-eye, last_diagonal.shape)
-        _, (left, right) = jax.lax.scan(
-            outwards, (0 * minus, minus), (uppers, _times(inverses, fills)), reverse=True
-        )
+        _, (before, after) = jax.lax.scan(outwards, (nothing, minus), (uppers, fills), reverse=True)
         last = Blocks(
             last_lower,
-            last_diagonal - _times(U[-1], _after(left[0])),
-            -_times(U[-1], _after(right[0])),
+            last_diagonal - times(U[-1], _after(before[0])),
+            -times(U[-1], _after(after[0])),
         )
         last = InOneLoop.of(last) if last_diagonal.shape[0] <= _ONE_LOOP else InChunks.of(last)
-        return InChunks(multipliers, inverses, uppers, left, right, U[-1], last)
+        return InChunks(pivots, lower, uppers, before, after, multiplier, U[-1], last)
 
     def solve(self, r: Float[Array, "b w"]) -> Float[Array, "b w"]:
         number, width = r.shape
         chunks = _chunks(r, jnp.zeros_like(r[0]))
-        reduced = _forwards(self.multiplier, chunks[1:], chunks[0])
-        end = reduced[-1]
-        inner = jnp.concatenate([chunks[:1], reduced[:-1]])
-        g = _backwards(self.upper, _apply(self.inverse, inner), jnp.zeros_like(end))
-        s = self.last.solve(end - _apply(self.last_upper, _after(g[0])))
-        x = g - _apply(self.left, _before(s)[None]) - _apply(self.right, s[None])
+        nothing = jnp.zeros_like(chunks[0])
+        y = _forwards(self.lower, apply(self.pivots.left, chunks[:-1]), nothing)
+        g = _backwards(self.upper, apply(self.pivots.right, y), nothing)
+        end = chunks[-1] - apply(self.last_multiplier, y[-1])
+        s = self.last.solve(end - apply(self.last_upper, _after(g[0])))
+        x = g - apply(self.before, _before(s)[None]) - apply(self.after, s[None])
         x = jnp.concatenate([x, s[None]])
         return jnp.swapaxes(x, 0, 1).reshape(-1, width)[:number]
 
@@ -161,7 +161,7 @@ def _chunks(A: Float[Array, "b ..."], fill: Float[Array, "..."]) -> Float[Array,
 def _forwards(multiplier, r, start):
     def step(before, block):
         multiplier, r = block
-        r = r - _apply(multiplier, before)
+        r = r - apply(multiplier, before)
         return r, r
 
     return jax.lax.scan(step, start, (multiplier, r))[1]
@@ -170,7 +170,7 @@ def _forwards(multiplier, r, start):
 def _backwards(upper, r, start):
     def step(after, block):
         upper, r = block
-        x = r - _apply(upper, after)
+        x = r - apply(upper, after)
         return x, x
 
     return jax.lax.scan(step, start, (upper, r), reverse=True)[1]
@@ -182,30 +182,3 @@ def _after(A: Array) -> Array:
 
 def _before(A: Array) -> Array:
     return jnp.concatenate([jnp.zeros_like(A[:1]), A[:-1]])
-
-
-def _times(A: Float[Array, "*b w w"], B: Float[Array, "*b w w"]) -> Float[Array, "*b w w"]:
-    width = A.shape[-1]
-    if width > _WRITTEN_OUT:
-        return A @ B
-    return sum(A[..., :, k, None] * B[..., None, k, :] for k in range(width))  # pyright: ignore[reportReturnType]
-
-
-def _apply(A: Float[Array, "*b w w"], x: Float[Array, "*c w"]) -> Float[Array, "*b w"]:
-    width = A.shape[-1]
-    if width > _WRITTEN_OUT:
-        return jnp.einsum("...ij,...j->...i", A, x)
-    return sum(A[..., :, k] * x[..., None, k] for k in range(width))  # pyright: ignore[reportReturnType]
-
-
-def _inverse(A: Float[Array, "*b w w"]) -> Float[Array, "*b w w"]:
-    """Gauss-Jordan elimination; not finite, or without meaning, for singular matrices."""
-    width = A.shape[-1]
-
-    def column(k, A):
-        here = jnp.broadcast_to(jnp.arange(width) == k, A.shape[:-1])
-        row = jnp.where(here, 1, A[..., k, :]) / A[..., k, k, None]
-        others = jnp.where(here[..., None, :], 0, A) - A[..., :, k, None] * row[..., None, :]
-        return jnp.where(here[..., :, None], row[..., None, :], others)
-
-    return jax.lax.fori_loop(0, width, column, A, unroll=width <= _WRITTEN_OUT)

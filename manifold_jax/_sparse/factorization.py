@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._custom_types import BoolScalar, FloatScalar
-from .._linear import AbstractRows
+from .._rows import AbstractRows
 from .elimination import Blocks, eliminate
 from .structure import Structure
 
@@ -56,8 +56,8 @@ class BlockFactorization(eqx.Module):
         )
 
     def _refined(self, eliminated: Any, multiply: Any, b: Float[Array, " m"]) -> Float[Array, " m"]:
-        """Elimination in blocks loses more digits than the condition of the matrix explains, which
-        one refinement brings back. That of tridiagonal matrices, with row exchanges, does not."""
+        """Refined once by products without the matrix, whose entries are rounded: near singular
+        positions that brings back a third of the digits. Tridiagonal matrices have none."""
         x = _in_order(self.structure, eliminated, b)
         if self.structure.width == 1:
             return x
@@ -69,7 +69,8 @@ class BlockFactorization(eqx.Module):
         too ill conditioned for the elimination; or else `A x = b` nevertheless."""
         r = jax.lax.stop_gradient(residual)
         change2 = jnp.abs(jnp.dot(r, _in_order(self.structure, self.eliminated, r)))
-        return change2 <= _tolerance(r.dtype) ** 2 * jax.lax.stop_gradient(size2)
+        tolerance = float(jnp.finfo(r.dtype).eps) ** (1 / 3)
+        return change2 <= tolerance**2 * jax.lax.stop_gradient(size2)
 
     @property
     def lengths(self) -> Float[Array, " m"]:
@@ -88,13 +89,9 @@ class BlockFactorization(eqx.Module):
         known = jnp.where(mixed >> 31 == 0, 1, -1).astype(lengths.dtype)  # signs without a pattern
         solution = self._refined(self.eliminated, product, product(known / lengths))
         error = jnp.max(jnp.abs(solution * lengths - known))
-        return error <= _tolerance(lengths.dtype)
-
-
-def _tolerance(dtype: Any) -> float:
-    """A solution of a system without full rank is off by as much as its size. Long chains are ill
-    conditioned, so that little can be asked for in single precision: 1e-4 (2e-2)."""
-    return float(jnp.finfo(dtype).eps) ** (1 / 4)
+        # Without full rank it is as large as the solution. Long chains are ill conditioned, so that
+        # little can be asked for in single precision: 1e-4 (2e-2).
+        return error <= float(jnp.finfo(lengths.dtype).eps) ** (1 / 4)
 
 
 def _fixed(rows: Any) -> Any:

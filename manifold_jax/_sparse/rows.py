@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._custom_types import Args
-from .._linear import AbstractRows
+from .._rows import AbstractRows
 from .factorization import BlockFactorization
 from .structure import Structure
 
