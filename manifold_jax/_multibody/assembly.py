@@ -15,10 +15,11 @@ from .._user_function import check_function
 from . import reading
 from .bodies import Bodies, Body, Frames, in_space, Pose
 from .checks import check_vector
-from .equations import group_joints, jacobian, JointGroup, residuals
 from .forces import AbstractForce
+from .joint_groups import group_joints, jacobian, JointGroup, residuals
 from .joints import AbstractJoint
-from .loads import AbstractLoads, add, group_forces
+from .load_groups import group_forces
+from .loads import AbstractLoads, add
 from .rotations import rates_matrix, turn_back
 from .start import make_state
 
@@ -76,7 +77,7 @@ class Assembly(eqx.Module):
         self.joints = group_joints(self.bodies, joints)
         self.loads = group_forces(self.bodies, self.joints, forces)
         gravity = np.zeros(d) if gravity is None else gravity
-        self.gravity = in_space(check_vector("`gravity`", gravity, d)[None])[0]
+        self.gravity = in_space(check_vector("`gravity`", gravity, d))
         self.redundant = redundant
         if self.bodies.planar and not self.joints:
             raise ValueError(
@@ -128,7 +129,8 @@ class Assembly(eqx.Module):
         return make_state(self, given, assemble)
 
     def gaps(self, q: Pose) -> dict[str, Float[Array, " r"]]:
-        """Residuals of the joints by name: lengths in metres, cosines of angles."""
+        """Residuals of the joints by name at the first part of a state `(q, v)`: lengths in metres,
+        cosines of angles."""
         gaps = residuals(self.joints, q)
         pairs = [
             (name, row)
@@ -206,7 +208,7 @@ def parametrized(build: Callable, *, redundant: bool = False) -> MechanicalSyste
     - `redundant`: as for [`Assembly`][], of which it takes the place.
     """
     check_function("build", build, "build(args)")
-    return _system(_Built(build), redundant)
+    return _system(_Built(build, redundant), redundant)
 
 
 class _Itself(eqx.Module):
@@ -218,12 +220,17 @@ class _Itself(eqx.Module):
 
 class _Built(AbstractOfArgs):
     function: Callable
+    redundant: bool = eqx.field(static=True)
 
     def __call__(self, args: Args) -> Assembly:
         assembly = self.function(args)
         if not isinstance(assembly, Assembly):
             raise TypeError(
                 f"`build` must return an `mj.multibody.Assembly`, got {type(assembly).__name__}."
+            )
+        if assembly.redundant and not self.redundant:
+            raise ValueError(
+                "`build` returns an `Assembly(..., redundant=True)`: write `parametrized(build, redundant=True)`, too."
             )
         return assembly
 
