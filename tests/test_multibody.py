@@ -332,6 +332,54 @@ def test_gradients_and_batches():
     np.testing.assert_allclose(jax.jit(jax.vmap(value))(batch), single, rtol=0, atol=1e-13)
 
 
+def test_a_mechanism_is_built_once_in_a_solve():
+    """Not in each of its stages and corrections."""
+    built = []
+
+    def build(values):
+        built.append(values)
+        return swing(values)
+
+    values = jnp.asarray([2.0, 0.5, 3.0])
+    y0, system = swing(values).state(), mb.parametrized(build)
+    jax.make_jaxpr(lambda values: swung(system, y0, values))(values)
+    assert len(built) == 1
+
+
+@pytest.mark.slow
+def test_lengths_and_masses_from_a_motion():
+    """Of a four-bar linkage, from an independent solution with noise: within three standard errors."""
+    problem = mj.problems.four_bar(t1=1.0)
+    true = {"coupler": 2.5, "rocker": 2.0}  # a length and a mass
+
+    def args_of(values):
+        lengths = problem.args.lengths.at[1].set(values["coupler"])
+        masses = problem.args.masses.at[2].set(values["rocker"])
+        return problem.args._replace(lengths=lengths, masses=masses)
+
+    def y0(values):
+        parts = (part.reshape(3, 3) for part in problem.with_args(args_of(values)).y0)
+        return tuple(mb.Pose(part[:, :2], part[:, 2]) for part in parts)
+
+    ts, sigma = np.linspace(0.05, 1.0, 20), 1e-3
+    exact = problem.reference(ts)[0][:, 3:5]  # the centre of the coupler
+    data = exact + sigma * np.random.default_rng(0).normal(size=exact.shape)
+    found = mj.fit(
+        mb.parametrized(lambda values: cases.four_bar(args_of(values))),
+        {"coupler": 2.4, "rocker": 1.7},
+        ts,
+        data,
+        t0=0.0,
+        y0=y0,
+        observe=lambda t, y, values: y[0].position[1],
+        sigma=sigma,
+    )
+    for name, value in true.items():
+        error = found.standard_errors[name]
+        assert error < 0.05 * value
+        assert abs(found.parameters[name] - value) < 3 * error
+
+
 # States
 
 
