@@ -10,8 +10,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from . import joints
-from .bodies import Bodies, Frames, in_space, Placed, Pose, with_ground
+from .bodies import Bodies, Pose
 from .checks import check_sequence, stack, unique_names
+from .frames import Frames, in_space, Placed, with_ground
 from .rotations import basis, compose, dot, turn, turn_back
 
 

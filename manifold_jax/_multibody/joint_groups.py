@@ -11,9 +11,10 @@ from jaxtyping import Array, Float
 
 from . import joints
 from .attachment import attach, Attachment, name_all
-from .bodies import Bodies, Frames, Placed, Pose, with_ground
+from .bodies import Bodies, Pose
 from .checks import check_number, is_concrete, stack
 from .equations import PLANAR, SPATIAL
+from .frames import Frames, Placed, with_ground
 from .rotations import length_of
 
 

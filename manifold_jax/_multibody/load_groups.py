@@ -9,8 +9,9 @@ from jaxtyping import Array
 from .._user_function import check_function
 from . import forces, joints
 from .attachment import attach, Attachment, name_all
-from .bodies import Bodies, in_space
+from .bodies import Bodies
 from .checks import check_number, check_shape, check_vector, is_concrete, stack
+from .frames import in_space
 from .joint_groups import JointGroup
 from .loads import AbstractLoads, BodyLoads, JointLoads, LineLoads, SpringLaws
 

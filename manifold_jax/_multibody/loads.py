@@ -10,8 +10,8 @@ from jaxtyping import Array, Float
 
 from .._custom_types import Args, FloatScalar, RealScalarLike
 from .attachment import Attachment
-from .bodies import Frames, in_space
 from .checks import check_shape, stack
+from .frames import Frames, in_space
 from .rotations import dot, length_of, turn
 
 

@@ -8,8 +8,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._custom_types import Args, FloatScalar, RealScalarLike
-from .bodies import Frames, Pose
+from .bodies import Pose
 from .checks import check_vector, floating
+from .frames import Frames
 from .joint_groups import reactions
 from .joints import Prismatic, Revolute
 from .loads import coordinate
