@@ -226,7 +226,8 @@ class Seconds(NamedTuple):
 
 class Coverage(NamedTuple):
     """Of fits to several draws of the noise: how many of the estimates lie within two standard errors
-    of the truth (about 95 % are expected), and of how many."""
+    of the truth (about 95 % are expected), and of how many. Not all are independent: those of the
+    lengths and of the mass of the arms move together."""
 
     within: int
     estimates: int
