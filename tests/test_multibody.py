@@ -332,6 +332,54 @@ def test_gradients_and_batches():
     np.testing.assert_allclose(jax.jit(jax.vmap(value))(batch), single, rtol=0, atol=1e-13)
 
 
+def test_a_mechanism_is_built_once_in_a_solve():
+    """Not in each of its stages and corrections."""
+    built = []
+
+    def build(values):
+        built.append(values)
+        return swing(values)
+
+    values = jnp.asarray([2.0, 0.5, 3.0])
+    y0, system = swing(values).state(), mb.parametrized(build)
+    jax.make_jaxpr(lambda values: swung(system, y0, values))(values)
+    assert len(built) == 1
+
+
+@pytest.mark.slow
+def test_lengths_and_masses_from_a_motion():
+    """Of a four-bar linkage, from an independent solution with noise: within three standard errors."""
+    problem = mj.problems.four_bar(t1=1.0)
+    true = {"coupler": 2.5, "rocker": 2.0}  # a length and a mass
+
+    def args_of(values):
+        lengths = problem.args.lengths.at[1].set(values["coupler"])
+        masses = problem.args.masses.at[2].set(values["rocker"])
+        return problem.args._replace(lengths=lengths, masses=masses)
+
+    def y0(values):
+        parts = (part.reshape(3, 3) for part in problem.with_args(args_of(values)).y0)
+        return tuple(mb.Pose(part[:, :2], part[:, 2]) for part in parts)
+
+    ts, sigma = np.linspace(0.05, 1.0, 20), 1e-3
+    exact = problem.reference(ts)[0][:, 3:5]  # the centre of the coupler
+    data = exact + sigma * np.random.default_rng(0).normal(size=exact.shape)
+    found = mj.fit(
+        mb.parametrized(lambda values: cases.four_bar(args_of(values))),
+        {"coupler": 2.4, "rocker": 1.7},
+        ts,
+        data,
+        t0=0.0,
+        y0=y0,
+        observe=lambda t, y, values: y[0].position[1],
+        sigma=sigma,
+    )
+    for name, value in true.items():
+        error = found.standard_errors[name]
+        assert error < 0.05 * value
+        assert abs(found.parameters[name] - value) < 3 * error
+
+
 # States
 
 
@@ -379,6 +427,44 @@ def test_a_fixed_pose_is_not_moved():
     np.testing.assert_allclose(torque, 0, atol=1e-13)
 
 
+def test_a_body_without_joints():
+    robot = mb.Assembly([A], gravity=GRAVITY)
+    a = accelerations(robot.system, robot.state())
+    np.testing.assert_allclose(a.position, [GRAVITY], rtol=0, atol=1e-14)
+
+
+@pytest.mark.parametrize(
+    ("spring", "expected"),
+    [
+        (mb.Spring("a", "b", 3.0, 0.0, 0.5, between=((0, 0, 0),) * 2), (0.5, -1.0, 0.0)),
+        (mb.Damper("a", "b", 0.5, between=((0, 0, 0),) * 2), (0.5, -1.0, 0.0)),
+        (mb.Spring("a", "b", 3.0, 1.0, between=((0, 0, 0),) * 2), np.full(3, np.nan)),
+        (mb.LinearActuator("a", "b", 1.0, between=((0, 0, 0),) * 2), np.full(3, np.nan)),
+    ],
+)
+def test_points_of_springs_that_coincide(spring, expected):
+    """What has a limit is that, with its derivatives; what has none is not a number."""
+    robot = mb.Assembly([A, B], [], [spring])
+    q, v = robot.state(None, None, {"a": (1.0, -2.0, 0.0)})
+    on_b = lambda q: robot._force(0.0, q, v, None).position[1]
+    value, slope = jax.jit(lambda q: (on_b(q), jax.jacfwd(on_b)(q)))(q)
+    np.testing.assert_allclose(value, expected, rtol=0, atol=1e-15)
+    if np.isfinite(expected).all():
+        stiffness = robot.loads[0].laws.stiffness[0]
+        np.testing.assert_allclose(slope.position[:, 1], -stiffness * np.eye(3), atol=1e-15)
+        slope = jax.jit(jax.grad(lambda q: robot.energy((q, v)).potential))(q)
+        np.testing.assert_array_equal(slope.coordinates, 0)
+
+
+def test_states_of_single_precision():
+    """Large mechanisms are closed to rounding."""
+    with jax.enable_x64(False):
+        args = mj.problems.four_bar().args
+        robot = cases.four_bar(args._replace(lengths=100 * args.lengths))
+        y = robot.state(None, {"crank": 2.0}, assemble=True)
+    assert y[0].coordinates.dtype == jnp.float32
+
+
 # What is refused
 
 
@@ -392,7 +478,7 @@ A, B = spatial("a"), spatial("b")
 @pytest.mark.parametrize(
     ("build", "message"),
     [
-        (lambda: spatial(inertia=(1.0, 1.0)), r"Body 'a': .*`inertia` a number .*got shapes \(\) and \(2,\)"),
+        (lambda: spatial(inertia=(1.0, 1.0)), r"Body 'a': `inertia` must be a number or of shape \(3,\) .*got shape \(2,\)"),
         (lambda: spatial(inertia=(1.0, 1.0, -1.0)), "must be positive definite"),
         (lambda: spatial(inertia=np.ones((3, 3))), "must be positive definite"),
         (lambda: spatial(inertia=(1.0, 1.0, 3.0)), "the largest exceeds"),
@@ -425,6 +511,26 @@ A, B = spatial("a"), spatial("b")
         (lambda: force(mb.Force("a", lambda t: t)), "must be a callable"),
         (lambda: force(mb.Spring("a", "b", (1.0, 2.0), between=((0, 0, 0), (1, 0, 0)))), "must be a number"),
         (lambda: mb.parametrized(3.0), "must be a callable"),
+        (lambda: spatial(mass=None), "`mass` must be a number, got None"),
+        (lambda: spatial(mass=np.inf), "`mass` must be finite"),
+        (lambda: spatial(inertia=(1.0, 1.0, np.nan)), "`inertia` must be finite"),
+        (lambda: mb.Body("p", 1.0, 1.0, orientation=np.nan), "`orientation` must be finite"),
+        (lambda: spatial(orientation=0.3), r"of shape \(4,\), a unit quaternion, got shape"),
+        (lambda: mb.quaternion((0, 0, 0), 1.0), "`axis` is zero"),
+        (lambda: mb.quaternion((0, 1), 1.0), r"`axis` must be of shape \(3,\)"),
+        (lambda: mb.Assembly(A), "`bodies` must be a sequence"),
+        (lambda: mb.Assembly([A], mb.Spherical("a", "b", at=(0, 0, 0))), "`joints` must be a sequence"),
+        (lambda: mb.Assembly([A], [], None), "`forces` must be a sequence"),
+        (lambda: joint(mb.Spherical("a", "b", at=(0, 0, 0), name=3)), "`name` of a joint must be a string"),
+        (lambda: joint(mb.Spherical("a", "b", at=(0, 0, 0), axis=(1, 0, 0))), "a Spherical has no `axis`"),
+        (lambda: joint(mb.Distance("a", "b", ((0, 0, 0), (1, 0, 0)), "long")), "`length` must be a number"),
+        (lambda: joint(mb.Distance("a", "b", ((0, 0, 0), (1, 0, 0)), np.inf)), "`length` must be finite"),
+        (lambda: force(mb.Spring("a", "b", np.nan, between=((0, 0, 0), (1, 0, 0)))), "`stiffness` must be finite"),
+        (lambda: force(mb.LinearActuator("a", "b", None, ((0, 0, 0), (1, 0, 0)))), "`value` must be a number, got None"),
+        (lambda: force(mb.Force("a", (1.0, 2.0))), r"`value` must be of shape \(3,\), got shape \(2,\)"),
+        (lambda: force(mb.Torque(mb.GROUND, (0, 0, 1))), "the ground does not move"),
+        (lambda: joint(mb.Spherical("a", "b", at=(0, 0, 0))).state(None, {"a": (2, 0, 0, 0)}), "`orientations` of 'a' must be a quaternion of norm 1"),
+        (lambda: mb.Assembly([mb.Body("p", 1.0, 1.0)], [mb.Revolute("p", "ground", at=(0, 0))]).state(None, None, None, {"p": (0, 0, 1)}), "`angular_velocities` of 'p' must be a number"),
     ],
 )  # fmt: skip
 def test_what_is_refused(as_a_user_meets_it, build, message):
@@ -441,8 +547,11 @@ def force(*forces):
 
 
 def test_values_of_the_wrong_shape_are_refused():
-    robot = force(mb.Force("a", (1.0, 2.0)))
-    with pytest.raises(ValueError, match=r"`value` must be of shape \(3,\), got \(2,\)"):
+    robot = force(mb.Force("a", lambda t, args: (1.0, 2.0)))
+    with pytest.raises(ValueError, match=r"`value` must be of shape \(3,\), got shape \(2,\)"):
         accelerations(robot.system, robot.state())
+    twice = lambda args: mb.Assembly([A], [], redundant=True)
+    with pytest.raises(ValueError, match=r"write `parametrized\(build, redundant=True\)`"):
+        accelerations(mb.parametrized(twice), robot.state())
     with pytest.raises(TypeError, match="must return an `mj.multibody.Assembly`"):
         accelerations(mb.parametrized(lambda args: 3.0), robot.state())

@@ -207,8 +207,25 @@ def test_what_is_refused(parts, message):
         mb.from_mujoco(BODY.format(*parts))
 
 
+def test_actuators_of_a_group_that_is_switched_off():
+    xml = BODY.format(FREE, QUIET, "", '<actuator><motor joint="j" group="1"/></actuator>')
+    xml = xml.replace("<mujoco>", '<mujoco><option actuatorgroupdisable="1"/>')
+    assert not mb.from_mujoco(xml).loads
+
+
+def test_contacts_that_the_file_excludes():
+    other = '<body name="other" pos="1 0 0"><freejoint/><geom size="0.1"/></body>'
+    excluded = '<contact><exclude body1="other" body2="bob"/></contact>'
+    robot = mb.from_mujoco(BODY.format(FREE, "", other, excluded))
+    assert robot.names == ("bob", "other")
+
+
 def test_what_is_left_out_on_request():
     xml = BODY.format('<joint name="j" range="-1 1" limited="true"/>', QUIET, "", "")
+    with pytest.raises(ValueError, match=r"mean nothing here: \['joint limits'\].*'joint limit'"):
+        mb.from_mujoco(xml, ignore=("joint limits",))
+    with pytest.raises(ValueError, match="`model` has no body that moves"):
+        mb.from_mujoco("<mujoco/>")
     robot = mb.from_mujoco(xml, ignore=("joint limit",))
     assert robot.joint_names == ("j",)
     with pytest.raises(TypeError, match="sequence of words"):

@@ -86,7 +86,16 @@ def solve(u: Float[Array, " N"], objective: Objective, batch: Any = None) -> Sol
         solved = jtu.tree_map(lambda leaf: jnp.where(failed, 0, leaf), Solved(out, matrices))
         return eqx.tree_at(lambda s: s.values.failed, solved, failed.astype(x.dtype))
 
-    return jax.vmap(one)(x, pieces)
+    return _each(one, x, pieces)
+
+
+def _each(function: Callable, x: Any, pieces: Piece) -> Any:
+    """For every piece. A batch of one alone takes half as long again to trace, and both branches of
+    every condition to run."""
+    if x.shape[0] > 1:
+        return jax.vmap(function)(x, pieces)
+    one = function(*jtu.tree_map(lambda leaf: leaf[0], (x, pieces)))
+    return jtu.tree_map(lambda leaf: leaf[None], one)
 
 
 def gaps(objective: Objective, predicted: Prediction) -> Float[Array, "joints d"]:
@@ -173,7 +182,7 @@ def _own_loss(objective: Objective, observed: Any, data: Any, weights: Any) -> F
 
 def _backwards_all(objective: Objective, x: Any, pieces: Piece) -> Prediction:
     rest = objective.simulator, objective.transform
-    return jax.vmap(lambda x, piece: _backwards(x, (piece, *rest)))(x, pieces)
+    return _each(lambda x, piece: _backwards(x, (piece, *rest)), x, pieces)
 
 
 @eqx.filter_custom_vjp

@@ -1,6 +1,6 @@
 """Rigid bodies with joints and forces, as a mechanical system."""
 
-from .assembly import Assembly as Assembly, parametrized as parametrized
+from .assembly import Assembly as Assembly
 from .bodies import Body as Body, GROUND as GROUND, Pose as Pose
 from .forces import (
     AbstractForce as AbstractForce,
@@ -23,4 +23,5 @@ from .joints import (
     Universal as Universal,
 )
 from .mujoco import from_mujoco as from_mujoco, state_of_mujoco as state_of_mujoco
+from .parametrized import parametrized as parametrized
 from .rotations import quaternion as quaternion

@@ -1,6 +1,6 @@
 """Bodies, joints and forces put together: a mechanical system."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
@@ -9,18 +9,19 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._custom_types import Args, FloatScalar, RealScalarLike
-from .._mechanics import AbstractPositions, MechanicalSystem
-from .._of_args import AbstractOfArgs
-from .._user_function import check_function
+from .._mechanics import MechanicalSystem
 from . import reading
-from .bodies import Bodies, Body, Frames, in_space, Pose
+from .bodies import Bodies, Body, Pose
 from .checks import check_vector
-from .equations import group_joints, jacobian, JointGroup, residuals
 from .forces import AbstractForce
+from .frames import Frames, in_space
+from .joint_groups import group_joints, jacobian, JointGroup, residuals
 from .joints import AbstractJoint
-from .loads import AbstractLoads, add, group_forces
+from .load_groups import group_forces
+from .loads import AbstractLoads, add
 from .rotations import rates_matrix, turn_back
 from .start import make_state
+from .system import Itself, system_of
 
 
 class Assembly(eqx.Module):
@@ -76,7 +77,7 @@ class Assembly(eqx.Module):
         self.joints = group_joints(self.bodies, joints)
         self.loads = group_forces(self.bodies, self.joints, forces)
         gravity = np.zeros(d) if gravity is None else gravity
-        self.gravity = in_space(check_vector("`gravity`", gravity, d)[None])[0]
+        self.gravity = in_space(check_vector("`gravity`", gravity, d))
         self.redundant = redundant
         if self.bodies.planar and not self.joints:
             raise ValueError(
@@ -88,7 +89,7 @@ class Assembly(eqx.Module):
     def system(self) -> MechanicalSystem:
         """Masses, constraints and forces as a [`MechanicalSystem`][], which has the `terms`, the
         manifold `constraint` and the `multipliers`."""
-        return _system(_Itself(self), self.redundant)
+        return system_of(Itself(self), self.redundant)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -128,7 +129,8 @@ class Assembly(eqx.Module):
         return make_state(self, given, assemble)
 
     def gaps(self, q: Pose) -> dict[str, Float[Array, " r"]]:
-        """Residuals of the joints by name: lengths in metres, cosines of angles."""
+        """Residuals of the joints by name at the first part of a state `(q, v)`: lengths in metres,
+        cosines of angles."""
         gaps = residuals(self.joints, q)
         pairs = [
             (name, row)
@@ -188,69 +190,3 @@ class Assembly(eqx.Module):
         local = turn_back(frames.rotation[:-1], torque)
         turning = 2 * turn_back(rates_matrix(q.orientation), local)
         return Pose(force, turning + self.bodies.gyroscopic(q, v))
-
-
-def parametrized(build: Callable, *, redundant: bool = False) -> MechanicalSystem:
-    """The system of an assembly that is built from the `args` of the solve, so that masses and
-    geometry can be differentiated and fitted.
-
-    ```python
-    system = mj.multibody.parametrized(lambda args: mj.multibody.Assembly(...))
-    sol = mj.diffeqsolve(system.terms, ..., y0, args={"mass": 2.0, "length": 0.3})
-    ```
-
-    **Arguments:**
-
-    - `build`: `build(args)` returns an [`Assembly`][], with the same bodies and joints whatever the
-        numbers are. Functions of forces get the same `args`.
-    - `redundant`: as for [`Assembly`][], of which it takes the place.
-    """
-    check_function("build", build, "build(args)")
-    return _system(_Built(build), redundant)
-
-
-class _Itself(eqx.Module):
-    assembly: Assembly
-
-    def __call__(self, args: Args) -> Assembly:
-        return self.assembly
-
-
-class _Built(AbstractOfArgs):
-    function: Callable
-
-    def __call__(self, args: Args) -> Assembly:
-        assembly = self.function(args)
-        if not isinstance(assembly, Assembly):
-            raise TypeError(
-                f"`build` must return an `mj.multibody.Assembly`, got {type(assembly).__name__}."
-            )
-        return assembly
-
-
-class _Mass(eqx.Module):
-    source: Callable
-
-    def __call__(self, q: Pose, args: Args) -> Any:
-        return self.source(args).bodies.mass_matrix(q)
-
-
-class _Joints(AbstractPositions):
-    source: Callable
-
-    def __call__(self, t: RealScalarLike, q: Pose, args: Args) -> tuple[Array, ...]:
-        return self.source(args)._equations(q)
-
-    def jacobian(self, t: RealScalarLike, q: Pose, args: Args) -> Float[Array, "m n"]:
-        return self.source(args)._jacobian(q)
-
-
-class _Forces(eqx.Module):
-    source: Callable
-
-    def __call__(self, t: RealScalarLike, q: Pose, v: Pose, args: Args) -> Pose:
-        return self.source(args)._force(t, q, v, args)
-
-
-def _system(source: Callable, redundant: bool) -> MechanicalSystem:
-    return MechanicalSystem(_Mass(source), _Joints(source), _Forces(source), redundant=redundant)

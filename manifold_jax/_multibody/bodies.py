@@ -1,7 +1,7 @@
 """Rigid bodies: what a user says of each, and the arrays of all of them."""
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -9,8 +9,16 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._mechanics import InvertedBlocks
-from .checks import check_vector, floating, is_concrete, unique_names
-from .rotations import compose, inverted, planar_rotation, rates_matrix, rotation_matrix, turn
+from .checks import (
+    check_number,
+    check_sequence,
+    check_shape,
+    check_vector,
+    is_concrete,
+    stack,
+    unique_names,
+)
+from .rotations import compose, inverted, rates_matrix, turn
 
 
 GROUND = "ground"
@@ -79,33 +87,33 @@ class Body(eqx.Module):
                 f"`name` of a body must be a string and not {GROUND!r}, which is what does not move, got {name!r}."
             )
         self.name = name
-        self.mass, self.inertia = floating(mass), floating(inertia)
-        if self.mass.shape != () or self.inertia.shape not in ((), (3,), (3, 3)):
-            raise ValueError(
-                f"Body {name!r}: `mass` must be a number and `inertia` a number (a body in the plane) or of shape (3,) "
-                f"or (3, 3) (in space), got shapes {self.mass.shape} and {self.inertia.shape}."
-            )
+        what = f"Body {name!r}"
+        self.mass = check_number(f"{what}: `mass`", mass)
+        self.inertia = check_shape(
+            f"{what}: `inertia`", inertia, (), (3,), (3, 3), advice=" (a number in the plane)"
+        )
         planar = self.inertia.ndim == 0
         d, still = (2, 0.0) if planar else (3, (1.0, 0.0, 0.0, 0.0))
         where = np.zeros(d) if position is None else position
-        self.position = check_vector(f"Body {name!r}: `position`", where, d)
-        self.orientation = _orientation(name, still if orientation is None else orientation, planar)
+        self.position = check_vector(f"{what}: `position`", where, d)
+        turned = still if orientation is None else orientation
+        self.orientation = check_orientation(f"{what}: `orientation`", turned, planar)
         _check_mass(self)
 
 
-def _orientation(name: str, orientation: Any, planar: bool) -> Float[Array, "..."]:
-    p = floating(orientation)
-    if p.shape != (() if planar else (4,)):
-        what = "an angle" if planar else "a unit quaternion of shape (4,)"
-        raise ValueError(f"Body {name!r}: `orientation` must be {what}, got shape {p.shape}.")
+def check_orientation(what: str, value: Any, planar: bool) -> Float[Array, "..."]:
+    """An angle, or a unit quaternion."""
     if planar:
-        return p
-    if is_concrete(p) and not abs(float(np.linalg.norm(p)) - 1) < 1e-6:
+        return check_shape(what, value, (), advice=", an angle")
+    p = check_shape(what, value, (4,), advice=", a unit quaternion")
+    if not is_concrete(p):
+        return p / jnp.sqrt(jnp.sum(p * p))
+    norm = np.linalg.norm(p)
+    if not abs(norm - 1) < 1e-6:
         raise ValueError(
-            f"Body {name!r}: `orientation` must be a quaternion of norm 1, got {np.asarray(p)}. Use e.g. "
-            "`mj.multibody.quaternion(axis, angle)`."
+            f"{what} must be a quaternion of norm 1, got {np.asarray(p)}. Use e.g. `mj.multibody.quaternion(axis, angle)`."
         )
-    return p / jnp.sqrt(jnp.sum(p * p))
+    return jnp.asarray(np.asarray(p) / norm)
 
 
 def _check_mass(body: Body) -> None:
@@ -130,6 +138,12 @@ def _check_mass(body: Body) -> None:
         )
 
 
+def _matrix(inertia: Array) -> Any:
+    if inertia.ndim == 2:
+        return inertia
+    return np.diag(np.asarray(inertia)) if is_concrete(inertia) else jnp.diag(inertia)
+
+
 class Bodies(eqx.Module):
     """The arrays of all bodies: masses `(N,)`, moments of inertia `(N,)` or matrices `(N, 3, 3)`,
     and the drawing."""
@@ -141,18 +155,17 @@ class Bodies(eqx.Module):
 
     @staticmethod
     def of(bodies: Sequence[Body]) -> "Bodies":
-        if not bodies or not all(isinstance(body, Body) for body in bodies):
+        bodies = check_sequence("bodies", bodies, Body, "`mj.multibody.Body`")
+        if not bodies:
             raise ValueError("`bodies` must be a sequence of at least one `mj.multibody.Body`.")
         names = unique_names("body", [body.name for body in bodies])
-        planar = {body.inertia.ndim == 0 for body in bodies}
-        if len(planar) > 1:
-            flat = [body.name for body in bodies if body.inertia.ndim == 0]
+        flat = [body.name for body in bodies if body.inertia.ndim == 0]
+        if 0 < len(flat) < len(bodies):
             raise ValueError(
                 f"Bodies {flat} have one moment of inertia (in the plane), the others three (in space): an assembly is "
                 "either in the plane or in space. Give all `inertia` the same kind."
             )
-        matrix = lambda body: jnp.diag(body.inertia) if body.inertia.ndim == 1 else body.inertia
-        inertia = [body.inertia if body.inertia.ndim == 0 else matrix(body) for body in bodies]
+        inertia = [_matrix(body.inertia) if not flat else body.inertia for body in bodies]
         drawing = Pose(stack([b.position for b in bodies]), stack([b.orientation for b in bodies]))
         return Bodies(names, stack([b.mass for b in bodies]), stack(inertia), drawing)
 
@@ -171,6 +184,12 @@ class Bodies(eqx.Module):
                 "and `mj.multibody.GROUND`."
             )
         return self.names.index(name)
+
+    def moving_index(self, name: Any, of: str) -> int:
+        i = self.index(name, of)
+        if i == len(self.names):
+            raise ValueError(f"{of}: the ground does not move. Name a body.")
+        return i
 
     def mass_matrix(self, q: Pose) -> Any:
         """A diagonal in the plane; in space blocks `diag(m, 4 G^T I G + 4 c p p^T)`, inverted.
@@ -204,58 +223,3 @@ class Bodies(eqx.Module):
         G, rates = rates_matrix(q.orientation), rates_matrix(v.orientation)
         momentum = turn(self.inertia, turn(G, v.orientation))
         return -8 * jnp.sum(rates * momentum[:, :, None], axis=1)
-
-
-class Placed(NamedTuple):
-    """Where the frames of bodies are in space; those in the plane are turned about the third axis."""
-
-    origin: Float[Array, "*n 3"]
-    rotation: Float[Array, "*n 3 3"]
-
-    @staticmethod
-    def of(q: Pose) -> "Placed":
-        turned = planar_rotation if q.planar else rotation_matrix
-        return Placed(in_space(q.position), turned(q.orientation))
-
-
-def with_ground(q: Pose) -> Float[Array, "n_and_1 c"]:
-    """A row of coordinates for each body and, last, for the ground."""
-    upright = np.zeros((1, q.coordinates.shape[-1]))
-    upright[0, 3:4] = 1  # of a quaternion
-    return jnp.concatenate([q.coordinates, jnp.asarray(upright, q.coordinates.dtype)])
-
-
-class Frames(NamedTuple):
-    """Origins, rotations, velocities and angular velocities in space of all bodies and, last, of
-    the ground."""
-
-    origin: Float[Array, "n 3"]
-    rotation: Float[Array, "n 3 3"]
-    velocity: Float[Array, "n 3"]
-    spin: Float[Array, "n 3"]
-
-    @staticmethod
-    def of(q: Pose, v: Pose) -> "Frames":
-        n = q.position.shape[0]
-        origin, rotation = Placed.of(q)
-        if q.planar:
-            spin = jnp.stack([jnp.zeros(n, v.orientation.dtype)] * 2 + [v.orientation], axis=1)
-        else:
-            spin = turn(rotation, 2 * turn(rates_matrix(q.orientation), v.orientation))
-        ground = jnp.eye(3, dtype=rotation.dtype)[None]
-        still = lambda rows: jnp.concatenate([in_space(rows), jnp.zeros((1, 3), rows.dtype)])
-        return Frames(
-            still(origin), jnp.concatenate([rotation, ground]), still(v.position), still(spin)
-        )
-
-
-def in_space(rows: Float[Array, "*n d"]) -> Float[Array, "*n 3"]:
-    """Vectors in the plane with a third component of zero."""
-    return jnp.pad(rows, ((0, 0),) * (rows.ndim - 1) + ((0, 3 - rows.shape[-1]),))
-
-
-def stack(values: Sequence[Any]) -> Array:
-    """One array; of concrete values without a program for each."""
-    if all(is_concrete(value) for value in values):
-        return jnp.asarray(np.stack([np.asarray(value) for value in values]))
-    return jnp.stack([jnp.asarray(value) for value in values])

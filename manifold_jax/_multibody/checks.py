@@ -21,16 +21,33 @@ def is_concrete(value: Any) -> bool:
     return not isinstance(value, jax.core.Tracer)
 
 
-def check_vector(what: str, value: Any, size: int) -> Array:
+def check_shape(what: str, value: Any, *shapes: tuple[int, ...], advice: str = "") -> Array:
+    """Finite numbers of one of the shapes."""
+    expected = " or ".join(f"of shape {shape}" if shape else "a number" for shape in shapes)
     try:
-        vector = floating(value)
+        array = floating(value)
     except (TypeError, ValueError):
-        raise ValueError(f"{what} must be of shape ({size},), got {value!r}.") from None
-    if vector.shape != (size,):
-        raise ValueError(f"{what} must be of shape ({size},), got {vector.shape}.")
-    if is_concrete(vector) and not np.all(np.isfinite(vector)):
-        raise ValueError(f"{what} must be finite, got {np.asarray(vector)}.")
-    return vector
+        raise ValueError(f"{what} must be {expected}{advice}, got {value!r}.") from None
+    if array.shape not in shapes:
+        raise ValueError(f"{what} must be {expected}{advice}, got shape {array.shape}.")
+    if is_concrete(array) and not np.all(np.isfinite(array)):
+        raise ValueError(f"{what} must be finite, got {np.asarray(array)}.")
+    return array
+
+
+def check_number(what: str, value: Any) -> Array:
+    return check_shape(what, value, ())
+
+
+def check_vector(what: str, value: Any, size: int) -> Array:
+    return check_shape(what, value, (size,))
+
+
+def stack(values: Sequence[Any]) -> Array:
+    """One array; of concrete values without a program for each."""
+    if all(is_concrete(value) for value in values):
+        return jnp.asarray(np.stack([np.asarray(value) for value in values]))
+    return jnp.stack([jnp.asarray(value) for value in values])
 
 
 def check_axis(what: str, value: Any) -> Array:
@@ -40,7 +57,30 @@ def check_axis(what: str, value: Any) -> Array:
     return axis
 
 
+def as_pair(what: str, value: Any) -> tuple[Any, Any]:
+    """Of points or axes; also the two rows of an array."""
+    is_array = isinstance(value, jax.Array | np.ndarray) and value.ndim == 2
+    if not (isinstance(value, tuple | list) or is_array) or len(value) != 2:
+        raise ValueError(f"{what}, got {value!r}.")
+    return value[0], value[1]
+
+
+def check_sequence(what: str, value: Any, kind: type, of: str) -> list[Any]:
+    """Of things of one kind, as a list."""
+    try:
+        things = list(value)
+    except TypeError:
+        raise TypeError(f"`{what}` must be a sequence of {of}, got {value!r}.") from None
+    for thing in things:
+        if not isinstance(thing, kind):
+            raise TypeError(f"`{what}` must be a sequence of {of}, one is {thing!r}.")
+    return things
+
+
 def unique_names(what: str, names: Sequence[str]) -> tuple[str, ...]:
+    for name in names:
+        if not isinstance(name, str) or not name:
+            raise ValueError(f"`name` of a {what} must be a string, got {name!r}.")
     if len(set(names)) < len(names):
         twice = sorted({name for name in names if names.count(name) > 1})
         raise ValueError(f"Every {what} needs its own name; there are several called {twice}.")

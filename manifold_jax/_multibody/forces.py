@@ -3,9 +3,19 @@
 A `value` is a number or array, or a function `f(t, args)` of the time and the `args` of the solve.
 """
 
-from typing import Any
+import abc
+from typing import Any, NamedTuple
 
 import equinox as eqx
+
+
+class SpringLaw(NamedTuple):
+    """`stiffness (x - rest) + damping x' - value` against a coordinate `x`."""
+
+    stiffness: Any = 0.0
+    rest: Any = 0.0
+    damping: Any = 0.0
+    value: Any = 0.0
 
 
 class AbstractForce(eqx.Module):
@@ -14,9 +24,40 @@ class AbstractForce(eqx.Module):
     name: eqx.AbstractVar[str | None]
 
 
-class Spring(AbstractForce):
+class AbstractLineForce(AbstractForce):
+    """Between two points, whose distance is the coordinate."""
+
+    first: eqx.AbstractVar[str]
+    second: eqx.AbstractVar[str]
+    between: eqx.AbstractVar[Any]
+    points: eqx.AbstractVar[Any]
+
+    @property
+    def drawn(self) -> Any:
+        return self.between
+
+    @property
+    @abc.abstractmethod
+    def law(self) -> SpringLaw: ...
+
+
+class AbstractJointForce(AbstractForce):
+    """In a hinge or slider, against its coordinate."""
+
+    joint: eqx.AbstractVar[str]
+
+    @property
+    @abc.abstractmethod
+    def law(self) -> SpringLaw: ...
+
+
+class Spring(AbstractLineForce):
     """A spring, and damper, between two points: they attract each other with
-    `stiffness (l - length) + damping l'`, `l` their distance, which must not become zero.
+    `stiffness (l - length) + damping l'`, `l` their distance.
+
+    Where the points coincide the force has no direction: that of a spring of `length` zero is zero
+    there, a damper's `damping` times the velocity of one point against the other, and others are
+    not a number, with which a solve ends.
 
     **Arguments:**
 
@@ -36,15 +77,11 @@ class Spring(AbstractForce):
     name: str | None = eqx.field(static=True, default=None)
 
     @property
-    def drawn(self):
-        return self.between
-
-    @property
-    def value(self):
-        return 0.0
+    def law(self):
+        return SpringLaw(self.stiffness, self.length, self.damping)
 
 
-class Damper(AbstractForce):
+class Damper(AbstractLineForce):
     """A damper between two points: they attract each other with `damping l'`. Arguments as for
     [`Spring`][]."""
 
@@ -56,23 +93,11 @@ class Damper(AbstractForce):
     name: str | None = eqx.field(static=True, default=None)
 
     @property
-    def drawn(self):
-        return self.between
-
-    @property
-    def stiffness(self):
-        return 0.0
-
-    @property
-    def length(self):
-        return 0.0
-
-    @property
-    def value(self):
-        return 0.0
+    def law(self):
+        return SpringLaw(damping=self.damping)
 
 
-class LinearActuator(AbstractForce):
+class LinearActuator(AbstractLineForce):
     """A cylinder between two points that pushes them apart with the force `value` (N), a number or
     `f(t, args)`. Other arguments as for [`Spring`][]."""
 
@@ -84,23 +109,11 @@ class LinearActuator(AbstractForce):
     name: str | None = eqx.field(static=True, default=None)
 
     @property
-    def drawn(self):
-        return self.between
-
-    @property
-    def stiffness(self):
-        return 0.0
-
-    @property
-    def length(self):
-        return 0.0
-
-    @property
-    def damping(self):
-        return 0.0
+    def law(self):
+        return SpringLaw(value=self.value)
 
 
-class JointSpring(AbstractForce):
+class JointSpring(AbstractJointForce):
     """A spring, and damper, in a hinge or slider: against its coordinate acts
     `stiffness (x - rest) + damping x'`.
 
@@ -119,11 +132,11 @@ class JointSpring(AbstractForce):
     name: str | None = eqx.field(static=True, default=None)
 
     @property
-    def value(self):
-        return 0.0
+    def law(self):
+        return SpringLaw(self.stiffness, self.rest, self.damping)
 
 
-class Motor(AbstractForce):
+class Motor(AbstractJointForce):
     """A motor in a hinge or slider: the torque (N m) or force (N) `value`, a number or `f(t, args)`, on
     the second body in the direction of the joint's coordinate, and its opposite on the first.
 
@@ -135,16 +148,8 @@ class Motor(AbstractForce):
     name: str | None = eqx.field(static=True, default=None)
 
     @property
-    def stiffness(self):
-        return 0.0
-
-    @property
-    def rest(self):
-        return 0.0
-
-    @property
-    def damping(self):
-        return 0.0
+    def law(self):
+        return SpringLaw(value=self.value)
 
 
 class Force(AbstractForce):

@@ -8,7 +8,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from .checks import check_axis, check_vector, is_concrete
+from .checks import as_pair, check_axis, check_vector, is_concrete
 
 
 class AbstractJoint(eqx.Module):
@@ -29,13 +29,23 @@ class AbstractJoint(eqx.Module):
     def drawn(self) -> tuple[Any, Any] | None:
         """The two points of space in the drawing, or `None`."""
 
+
+class AbstractPointJoint(AbstractJoint):
+    """A joint at one point, of which the kind says what its `axis` is, if it has one."""
+
+    first: str = eqx.field(static=True)
+    second: str = eqx.field(static=True)
+    at: Any = None
+    axis: Any = None
+    points: Any = None
+    name: str | None = eqx.field(static=True, default=None)
+
     @property
-    def axes(self) -> tuple[Any, Any]:
-        """Of the first and of the second body, in the drawing."""
-        return None, None
+    def drawn(self):
+        return None if self.at is None else (self.at, self.at)
 
 
-class Revolute(AbstractJoint):
+class Revolute(AbstractPointJoint):
     """A hinge: one point in common, and in space the direction `axis`. Two equations in the plane,
     where it has no axis, five in space.
 
@@ -46,121 +56,36 @@ class Revolute(AbstractJoint):
     - `name`: by default made of kind and bodies.
     """
 
-    first: str = eqx.field(static=True)
-    second: str = eqx.field(static=True)
-    at: Any = None
-    axis: Any = None
-    points: Any = None
-    name: str | None = eqx.field(static=True, default=None)
 
-    @property
-    def drawn(self):
-        return None if self.at is None else (self.at, self.at)
-
-    @property
-    def axes(self):
-        return self.axis, self.axis
-
-
-class Spherical(AbstractJoint):
+class Spherical(AbstractPointJoint):
     """A ball joint: one point in common, three equations; in space only. Arguments as for
     [`Revolute`][], without an axis."""
 
-    first: str = eqx.field(static=True)
-    second: str = eqx.field(static=True)
-    at: Any = None
-    points: Any = None
-    name: str | None = eqx.field(static=True, default=None)
 
-    @property
-    def drawn(self):
-        return None if self.at is None else (self.at, self.at)
-
-
-class Prismatic(AbstractJoint):
+class Prismatic(AbstractPointJoint):
     """A slider: it moves along `axis` and does not turn, as in the drawing. Two equations in the
     plane, five in space. Arguments as for [`Revolute`][]; `axis` has shape `(2,)` in the plane."""
 
-    first: str = eqx.field(static=True)
-    second: str = eqx.field(static=True)
-    at: Any = None
-    axis: Any = None
-    points: Any = None
-    name: str | None = eqx.field(static=True, default=None)
 
-    @property
-    def drawn(self):
-        return None if self.at is None else (self.at, self.at)
-
-    @property
-    def axes(self):
-        return self.axis, self.axis
-
-
-class Cylindrical(AbstractJoint):
+class Cylindrical(AbstractPointJoint):
     """Sliding along `axis` and turning about it: four equations; in space only. Arguments as for
     [`Revolute`][]."""
 
-    first: str = eqx.field(static=True)
-    second: str = eqx.field(static=True)
-    at: Any = None
-    axis: Any = None
-    points: Any = None
-    name: str | None = eqx.field(static=True, default=None)
 
-    @property
-    def drawn(self):
-        return None if self.at is None else (self.at, self.at)
-
-    @property
-    def axes(self):
-        return self.axis, self.axis
-
-
-class Universal(AbstractJoint):
+class Universal(AbstractPointJoint):
     """A Cardan joint: one point in common, and two axes that stay perpendicular, the first fixed in
     the first body, the second in the second: four equations; in space only.
 
     **Arguments:** as for [`Revolute`][], but `axis` is a pair of axes, perpendicular in the drawing.
     """
 
-    first: str = eqx.field(static=True)
-    second: str = eqx.field(static=True)
-    at: Any = None
-    axis: Any = None
-    points: Any = None
-    name: str | None = eqx.field(static=True, default=None)
 
-    @property
-    def drawn(self):
-        return None if self.at is None else (self.at, self.at)
-
-    @property
-    def axes(self):
-        if not (isinstance(self.axis, tuple | list) and len(self.axis) == 2):
-            raise ValueError(
-                f"`axis` of the universal joint of {self.first!r} and {self.second!r} must be a pair of axes, the first "
-                f"fixed in {self.first!r}, the second in {self.second!r}, got {self.axis!r}."
-            )
-        return self.axis[0], self.axis[1]
-
-
-class Fixed(AbstractJoint):
+class Fixed(AbstractPointJoint):
     """A weld: no motion against the drawing. Three equations in the plane, six in space.
 
-    **Arguments:** as for [`Revolute`][]; `at` is where joint forces are told, by default the centre
-    of mass of the first body that is not the ground.
+    **Arguments:** as for [`Revolute`][], without an axis; `at` is where joint forces are told, by
+    default the centre of mass of the first body that is not the ground.
     """
-
-    first: str = eqx.field(static=True)
-    second: str = eqx.field(static=True)
-    at: Any = None
-    points: Any = None
-    name: str | None = eqx.field(static=True, default=None)
-
-    @property
-    def drawn(self):
-        return None if self.at is None else (self.at, self.at)
 
 
 class Distance(AbstractJoint):
@@ -186,42 +111,59 @@ class Distance(AbstractJoint):
         return self.between
 
 
+WITH_AXIS = {
+    False: (Revolute, Universal, Cylindrical, Prismatic),
+    True: (Prismatic,),  # in the plane
+}
+
+
 def ends(thing: Any, name: str, planar: bool) -> tuple[bool, Any, Any]:
     """The two points of a joint or a force, and whether they are those of the drawing."""
     d = 2 if planar else 3
     drawn, pair = thing.drawn, thing.points
-    word = "between" if hasattr(thing, "between") else "at"
+    word = "at" if isinstance(thing, AbstractPointJoint) else "between"
     if (drawn is None) == (pair is None):
         raise ValueError(
             f"{name}: give either `{word}` (in space, as drawn) or `points` (a pair, one in the frame of each body)."
         )
     pair, word = (pair, "points") if drawn is None else (drawn, word)
-    if not (isinstance(pair, tuple | list) and len(pair) == 2):
-        raise ValueError(f"{name}: `{word}` must be a pair of points, got {pair!r}.")
+    pair = as_pair(f"{name}: `{word}` must be a pair of points", pair)
     first, second = (check_vector(f"{name}: `{word}`", point, d) for point in pair)
     return drawn is not None, first, second
 
 
-def drawn_axes(joint: AbstractJoint, name: str, planar: bool, needed: bool) -> tuple[Any, Any]:
-    """Both axes in space. In the plane the axis of a slider lies in it."""
-    axes = joint.axes
-    if not needed:
-        if any(axis is not None for axis in axes):
-            raise ValueError(f"{name}: in the plane a hinge has no `axis`; leave it out.")
+def drawn_axes(joint: AbstractJoint, name: str, planar: bool) -> tuple[Any, Any]:
+    """Of the first and of the second body, in space. In the plane the axis of a slider lies in it."""
+    axis = getattr(joint, "axis", None)
+    if not isinstance(joint, WITH_AXIS[planar]):
+        if axis is not None:
+            where = " in the plane" if planar else ""
+            raise ValueError(
+                f"{name}: a {type(joint).__name__}{where} has no `axis`; leave it out."
+            )
         # of frames whose columns are those of the body, as far as possible
-        axis = np.array([0.0, 0.0, 1.0])
-        return axis, axis
-    if any(axis is None for axis in axes):
+        upright = np.array([0.0, 0.0, 1.0])
+        return upright, upright
+    if isinstance(joint, Universal):
+        return _perpendicular(joint, name)
+    if axis is None:
         raise ValueError(f"{name} needs an `axis` of shape ({2 if planar else 3},).")
     if planar:
-        axes = [check_vector(f"{name}: `axis`", axis, 2) for axis in axes]
-        axes = [jnp.concatenate([axis, jnp.zeros(1, axis.dtype)]) for axis in axes]
-    axes = [check_axis(f"{name}: `axis`", axis) for axis in axes]
-    if isinstance(joint, Universal) and all(is_concrete(axis) for axis in axes):
-        a, b = (np.asarray(axis) / np.linalg.norm(axis) for axis in axes)
+        axis = check_vector(f"{name}: `axis`", axis, 2)
+        axis = jnp.concatenate([axis, jnp.zeros(1, axis.dtype)])
+    axis = check_axis(f"{name}: `axis`", axis)
+    return axis, axis
+
+
+def _perpendicular(joint: Universal, name: str) -> tuple[Any, Any]:
+    first, second = joint.first, joint.second
+    what = f"{name}: `axis` must be a pair of axes, the first fixed in {first!r}, the second in {second!r}"
+    first, second = (check_axis(f"{name}: `axis`", axis) for axis in as_pair(what, joint.axis))
+    if is_concrete(first) and is_concrete(second):
+        a, b = (np.asarray(axis) / np.linalg.norm(axis) for axis in (first, second))
         if abs(a @ b) > 1e-6:
             angle = np.degrees(np.arccos(np.clip(a @ b, -1, 1)))
             raise ValueError(
                 f"{name}: its two axes must be perpendicular in the drawing, the angle is {angle:.4g} degrees."
             )
-    return axes[0], axes[1]
+    return first, second

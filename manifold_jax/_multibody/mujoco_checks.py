@@ -30,6 +30,20 @@ COUNTED = (
     ("nplugin", "plugin"),
     ("nmocap", "mocap body"),
 )
+OTHERS = (
+    "contact",
+    "fluid",
+    "disabled springs or dampers",
+    "damping of several coordinates",
+    "stiffness of several coordinates",
+    "moving body without mass",
+    "actuator that is not of a joint",
+    "actuator of several coordinates",
+    "actuator gain that is not constant",
+    "actuator dynamics",
+    "actuator bias that is not affine",
+    "equality of type ...",
+)
 HINT = "Remove them, or leave them out of the motion by `ignore=(...)` with some of {words}."
 
 
@@ -54,6 +68,7 @@ def name_of(mujoco: Any, model: Any, kind: str, i: Index) -> str:
 def refuse_unsupported(mujoco: Any, model: Any, ignore: Sequence[str]) -> None:
     if isinstance(ignore, str):
         raise TypeError(f"`ignore` must be a sequence of words, write `ignore=({ignore!r},)`.")
+    _check_words(ignore)
     found: dict[str, list[str]] = {}
     for word, name in _unsupported(mujoco, model):
         if word not in ignore:
@@ -69,12 +84,22 @@ def refuse_unsupported(mujoco: Any, model: Any, ignore: Sequence[str]) -> None:
         )
 
 
+def _check_words(ignore: Sequence[str]) -> None:
+    known = [*dict.fromkeys(entry[-1] for entry in (*REFUSED, *COUNTED)), *OTHERS]
+    of_equality = "equality of type "
+    unknown = [word for word in ignore if word not in known and not word.startswith(of_equality)]
+    if unknown:
+        raise ValueError(
+            f"`ignore` has words that mean nothing here: {unknown}. Those that do are {', '.join(map(repr, known))}."
+        )
+
+
 def _unsupported(mujoco: Any, model: Any) -> Iterator[tuple[str, str]]:
     for attribute, kind, word in REFUSED:
         entries = np.asarray(getattr(model, attribute, np.zeros(0)))
-        if attribute == "jnt_limited" and _disabled(mujoco, model, "LIMIT"):
+        if attribute == "jnt_limited" and disabled(mujoco, model, "LIMIT"):
             continue
-        if attribute == "dof_frictionloss" and _disabled(mujoco, model, "FRICTIONLOSS"):
+        if attribute == "dof_frictionloss" and disabled(mujoco, model, "FRICTIONLOSS"):
             continue
         rows = entries.reshape(entries.shape[0], -1) if entries.size else np.zeros((0, 1))
         for i in np.flatnonzero(np.any(rows != 0, axis=1)):
@@ -88,11 +113,11 @@ def _unsupported(mujoco: Any, model: Any) -> Iterator[tuple[str, str]]:
     if model.opt.density != 0 or model.opt.viscosity != 0:
         yield "fluid", "density and viscosity of option"
     for flag in ("SPRING", "DAMPER"):
-        if _disabled(mujoco, model, flag):
+        if disabled(mujoco, model, flag):
             yield "disabled springs or dampers", f"flag {flag.lower()}"
 
 
-def _disabled(mujoco: Any, model: Any, flag: str) -> bool:
+def disabled(mujoco: Any, model: Any, flag: str) -> bool:
     bit = getattr(mujoco.mjtDisableBit, f"mjDSBL_{flag}", 0)
     return bool(model.opt.disableflags & int(bit))
 
@@ -153,7 +178,7 @@ def _elements(mujoco: Any, model: Any) -> Iterator[tuple[str, str]]:
 def _contacts(mujoco: Any, model: Any) -> Iterator[tuple[str, str]]:
     """The first geometry that may touch another; those of one body, and of a body and its parent
     that moves, do not."""
-    if _disabled(mujoco, model, "CONTACT"):
+    if disabled(mujoco, model, "CONTACT"):
         return
     if model.npair > 0:
         yield "contact", "explicit pairs"
@@ -165,6 +190,8 @@ def _contacts(mujoco: Any, model: Any) -> Iterator[tuple[str, str]]:
         )
         a, b = body[i], body
         parent = (welded[parents[a]] == b) | (welded[parents[b]] == a)
-        related = (a == b) | (parent & (a != 0) & (b != 0))
+        pair = np.sort(np.stack([model.geom_bodyid, 0 * b + model.geom_bodyid[i]]), axis=0)
+        excluded = np.isin((pair[0] << 16) + pair[1], model.exclude_signature)
+        related = excluded | (a == b) | (parent & (a != 0) & (b != 0))
         if np.any((touches != 0) & ~related):
             yield "contact", name_of(mujoco, model, "geom", i)

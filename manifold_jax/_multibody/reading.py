@@ -8,9 +8,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._custom_types import Args, FloatScalar, RealScalarLike
-from .bodies import Frames, Pose
+from .bodies import Pose
 from .checks import check_vector, floating
-from .equations import reactions
+from .frames import Frames
+from .joint_groups import reactions
 from .joints import Prismatic, Revolute
 from .loads import coordinate
 from .rotations import rates_matrix, turn
@@ -58,9 +59,7 @@ def over_times(function: Callable) -> Callable:
 
 @over_times
 def motion(assembly: Any, y: tuple[Pose, Pose], name: str) -> Motion:
-    i = assembly.bodies.index(name, "`motion`")
-    if i == len(assembly.names):
-        raise ValueError("`motion`: the ground does not move. Name a body.")
+    i = assembly.bodies.moving_index(name, "`motion`")
     q, v = y
     spin = Frames.of(q, v).spin[i]
     return Motion(

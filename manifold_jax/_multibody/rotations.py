@@ -5,11 +5,13 @@ Source: Haug, Computer Aided Kinematics and Dynamics of Mechanical Systems (1989
 
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from .._custom_types import BoolScalar
+from .checks import check_axis, check_number
 
 
 def quaternion(axis: Any, angle: Any) -> Float[Array, "4"]:
@@ -19,7 +21,11 @@ def quaternion(axis: Any, angle: Any) -> Float[Array, "4"]:
 
     - `axis`: shape `(3,)`, not zero. `angle`: in radian, counter-clockwise seen from its tip.
     """
-    axis, angle = jnp.asarray(axis, float), jnp.asarray(angle, float)
+    return _about(check_axis("`axis`", axis), check_number("`angle`", angle))
+
+
+@jax.jit
+def _about(axis: Float[Array, "3"], angle: Float[Array, ""]) -> Float[Array, "4"]:
     unit = axis / jnp.sqrt(jnp.sum(axis * axis))
     return jnp.concatenate([jnp.cos(angle / 2)[None], jnp.sin(angle / 2) * unit])
 
@@ -80,15 +86,21 @@ def inverted(A: Float[Array, "n 3 3"]) -> tuple[Float[Array, "n 3 3"], BoolScala
     return cofactors / safe[:, None, None], jnp.all(positive)
 
 
-def dot(a: Float[Array, "n i"], b: Float[Array, "n i"]) -> Float[Array, " n"]:
-    return jnp.sum(a * b, axis=1)
+def dot(a: Float[Array, "*n i"], b: Float[Array, "*n i"]) -> Float[Array, "*n"]:
+    return jnp.sum(a * b, axis=-1)
 
 
-def basis(axis: Float[Array, "n 3"]) -> Float[Array, "n 3 3"]:
+def length_of(a: Float[Array, "*n i"]) -> Float[Array, "*n"]:
+    """`|a|`, with the derivative zero where it is zero."""
+    square = dot(a, a)
+    return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1)), 0)
+
+
+def basis(axis: Float[Array, "*n 3"]) -> Float[Array, "*n 3 3"]:
     """Right-handed orthonormal frames whose third column has the direction of `axis`."""
-    w = axis / jnp.sqrt(dot(axis, axis))[:, None]
-    least = jnp.argmin(jnp.abs(w), axis=1)
-    helper = (jnp.arange(3)[None, :] == least[:, None]).astype(w.dtype)
+    w = axis / jnp.sqrt(dot(axis, axis))[..., None]
+    least = jnp.argmin(jnp.abs(w), axis=-1)
+    helper = jnp.eye(3, dtype=w.dtype)[least]
     u = jnp.cross(helper, w)
-    u = u / jnp.sqrt(dot(u, u))[:, None]
-    return jnp.stack([u, jnp.cross(w, u), w], axis=2)
+    u = u / jnp.sqrt(dot(u, u))[..., None]
+    return jnp.stack([u, jnp.cross(w, u), w], axis=-1)

@@ -12,17 +12,28 @@ import jax.flatten_util as jfu
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
+from jaxtyping import Array
 
-from .bodies import Pose
-from .checks import check_vector, floating, is_concrete
+from .bodies import check_orientation, Pose
+from .checks import check_number, check_vector, is_concrete, stack
 from .rotations import rates_matrix, rotation_matrix
 
 
-# Joints count as closed below this gap (m, or the cosine of an angle).
-CLOSED = 1e-6
+# Joints count as closed below this gap (m, or the cosine of an angle), or this many units of rounding.
+CLOSED, ROUNDING = 1e-6, 50
 ITERATIONS = 50
-# Singular values below this fraction of the largest belong to equations that depend on others.
+# Singular values below this fraction of the largest belong to equations that depend on others; at
+# least a hundred units of rounding.
 DEPENDENT = 1e-9
+
+
+def _closed(x: np.ndarray) -> float:
+    largest = float(np.abs(x).max(initial=1))
+    return max(CLOSED, ROUNDING * float(np.finfo(x.dtype).eps) * largest)
+
+
+def _dependent(J: np.ndarray) -> float:
+    return max(DEPENDENT, 100 * float(np.finfo(J.dtype).eps))
 
 
 def make_state(assembly: Any, given: tuple, assemble: bool) -> tuple[Pose, Pose]:
@@ -44,43 +55,44 @@ def make_state(assembly: Any, given: tuple, assemble: bool) -> tuple[Pose, Pose]
 def _with_given(assembly: Any, given: tuple) -> tuple[tuple[Pose, Pose], tuple[Pose, Pose]]:
     """The state, and where it was given."""
     bodies = assembly.bodies
-    q, d = bodies.drawing, 2 if bodies.planar else 3
+    q, planar = bodies.drawing, bodies.planar
     positions, orientations, velocities, spins = given
-    place = lambda rows, words, what, size: _place(bodies, rows, words or {}, what, size)
-    of_rotation = () if bodies.planar else (4,)
-    x, has_x = place(q.position, positions, "positions", (d,))
-    p, has_p = place(q.orientation, orientations, "orientations", of_rotation)
-    if not bodies.planar:
-        p = p / jnp.sqrt(jnp.sum(p * p, axis=1))[:, None]
-    u, has_u = place(jnp.zeros_like(x), velocities, "velocities", (d,))
-    none = jnp.zeros((x.shape[0], *(() if bodies.planar else (3,))), x.dtype)
-    w, has_w = place(none, spins, "angular_velocities", none.shape[1:])
-    rate = w if bodies.planar else quaternion_rate(p, w)
-    spread = lambda has, like: np.broadcast_to(
-        np.asarray(has).reshape(-1, *(1,) * (like.ndim - 1)), like.shape
-    )
-    fixed = Pose(spread(has_x, x), spread(has_p, p)), Pose(spread(has_u, x), spread(has_w, p))  # pyright: ignore[reportArgumentType]
+    d = 2 if planar else 3
+    vector = lambda what, value: check_vector(what, value, d)
+    turned = lambda what, value: check_orientation(what, value, planar)
+    spin = check_number if planar else vector
+    x, has_x = _place(bodies, q.position, positions, "positions", vector)
+    p, has_p = _place(bodies, q.orientation, orientations, "orientations", turned)
+    still = np.zeros((len(bodies.names), 3), q.coordinates.dtype)
+    u, has_u = _place(bodies, still[:, :d], velocities, "velocities", vector)
+    no_spin = still[:, 0] if planar else still
+    w, has_w = _place(bodies, no_spin, spins, "angular_velocities", spin)
+    rate = w if planar else quaternion_rate(p, w)
+    spread = lambda has, like: np.broadcast_to(has.reshape(-1, *(1,) * (like.ndim - 1)), like.shape)
+    fixed = Pose(spread(has_x, x), spread(has_p, p)), Pose(spread(has_u, x), spread(has_w, p))
     return (Pose(x, p), Pose(u, rate)), fixed
 
 
+@jax.jit
 def quaternion_rate(p: Any, spin: Any) -> Any:
     """`p' = G(p)^T R(p)^T omega / 2` of angular velocities in space, `(..., 3)`."""
     local = jnp.sum(rotation_matrix(p) * spin[..., :, None], axis=-2)
     return jnp.sum(rates_matrix(p) * local[..., :, None], axis=-2) / 2
 
 
-def _place(bodies: Any, rows: Any, words: dict, what: str, shape: tuple) -> tuple[Any, list]:
+def _place(
+    bodies: Any, rows: Any, words: Any, what: str, checked: Callable
+) -> tuple[Array, np.ndarray]:
+    """The rows with those that are given by name, and which are."""
+    words = {} if words is None else words
     if not isinstance(words, dict):
         raise TypeError(f"`{what}` must be a dictionary of names of bodies, got {words!r}.")
-    has = [False] * rows.shape[0]
+    has = np.zeros(len(bodies.names), bool)
+    rows = list(np.asarray(rows) if is_concrete(rows) else rows)
     for name, value in words.items():
-        i = bodies.index(name, f"`{what}`")
-        if i == len(has):
-            raise ValueError(f"`{what}`: the ground does not move.")
-        if shape:
-            value = check_vector(f"`{what}` of {name!r}", value, shape[0])
-        rows, has[i] = rows.at[i].set(floating(value)), True
-    return rows, has
+        i = bodies.moving_index(name, f"`{what}`")
+        rows[i], has[i] = checked(f"`{what}` of {name!r}", value), True
+    return stack(rows), has
 
 
 class _Host:
@@ -107,10 +119,10 @@ class _Host:
             phi, J = self(x)
             if np.abs(phi).max(initial=0) < 10 * np.finfo(x.dtype).eps:
                 break
-            x[~kept_x] -= np.linalg.lstsq(J[:, ~kept_x], phi, rcond=DEPENDENT)[0]
+            x[~kept_x] -= np.linalg.lstsq(J[:, ~kept_x], phi, rcond=_dependent(J))[0]
         self.check_positions(x, " Whatever the other bodies do, the joints cannot be closed")
         _, J = self(x)
-        w[~kept_w] -= np.linalg.lstsq(J[:, ~kept_w], J @ w, rcond=DEPENDENT)[0]
+        w[~kept_w] -= np.linalg.lstsq(J[:, ~kept_w], J @ w, rcond=_dependent(J))[0]
         return self.unravel(jnp.asarray(x)), self.unravel(jnp.asarray(w))
 
     def check(self, y: tuple[Pose, Pose]) -> None:
@@ -118,7 +130,7 @@ class _Host:
         self.check_positions(x, "")
         _, J = self(x)
         rate = np.abs(J @ w)
-        if not rate.max(initial=0) <= CLOSED * max(1, np.abs(w).max()):
+        if not rate.max(initial=0) <= _closed(x) * max(1, np.abs(w).max()):
             raise ValueError(
                 f"The velocities do not agree with the joints: {self._worst(rate, 'm/s')}. Give only those that are known, "
                 "such that joints allow them, and `assemble=True`."
@@ -128,7 +140,7 @@ class _Host:
 
     def check_positions(self, x: np.ndarray, reason: str) -> None:
         gap = np.abs(self(x)[0])
-        if not gap.max(initial=0) <= CLOSED:
+        if not gap.max(initial=0) <= _closed(x):
             advice = (
                 f"{reason}: check lengths and points, or give less."
                 if reason
@@ -141,7 +153,7 @@ class _Host:
     def _worst(self, size: np.ndarray, unit: str) -> str:
         largest = [size[rows].max() for _, rows in self._rows()]
         order = np.argsort(largest)[::-1][:5]
-        worst = [(self._rows()[i][0], largest[i]) for i in order if largest[i] > CLOSED]
+        worst = [(self._rows()[i][0], largest[i]) for i in order if not largest[i] <= CLOSED]
         return ", ".join(f"{name} (gap {gap:.3g} {unit})" for name, gap in worst)
 
     def _rows(self) -> list[tuple[str, np.ndarray]]:
@@ -159,7 +171,7 @@ class _Host:
     def _check_rank(self, J: np.ndarray) -> None:
         J = J / np.maximum(np.linalg.norm(J, axis=1, keepdims=True), np.finfo(J.dtype).tiny)
         left, sizes, _ = np.linalg.svd(J, full_matrices=True)
-        rank = int(np.sum(sizes > DEPENDENT * sizes.max(initial=1)))
+        rank = int(np.sum(sizes > _dependent(J) * sizes.max(initial=1)))
         if rank == J.shape[0]:
             return
         among = np.abs(left[:, rank:]).max(axis=1)

@@ -1,0 +1,131 @@
+"""Where joints and forces are attached: points and orthonormal frames in their two bodies."""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from . import joints
+from .bodies import Bodies, Pose
+from .checks import check_sequence, stack, unique_names
+from .frames import Frames, in_space, Placed, with_ground
+from .rotations import basis, compose, dot, turn, turn_back
+
+
+class Sides(NamedTuple):
+    """Points and frames of `k` joints in space, of their first and of their second bodies."""
+
+    first: Float[Array, "k 3"]
+    second: Float[Array, "k 3"]
+    frame_first: Float[Array, "k 3 3"]
+    frame_second: Float[Array, "k 3 3"]
+
+    @property
+    def gap(self) -> Float[Array, "k 3"]:
+        return self.second - self.first
+
+    def cosine(self, i: int, j: int) -> Float[Array, " k"]:
+        """Of the angle between axis `i` of the first and axis `j` of the second body."""
+        return dot(self.frame_first[:, :, i], self.frame_second[:, :, j])
+
+    def along(self, i: int) -> Float[Array, " k"]:
+        return dot(self.frame_first[:, :, i], self.gap)
+
+    @property
+    def angle(self) -> Float[Array, " k"]:
+        """About the third axis, zero in the drawing, from `-pi` to `pi`."""
+        return jnp.arctan2(self.cosine(1, 0), self.cosine(0, 0))
+
+
+class Attachment(eqx.Module):
+    """Which bodies `k` joints or forces belong to (static: the graph of the mechanism), and their
+    points and frames in those, of first and of second bodies."""
+
+    names: tuple[str, ...] = eqx.field(static=True)
+    bodies: tuple[tuple[int, ...], tuple[int, ...]] = eqx.field(static=True)
+    points: Float[Array, "2 k 3"]
+    axes: Float[Array, "2 k 3 3"]
+
+    @property
+    def index(self) -> np.ndarray:
+        return np.asarray(self.bodies)
+
+    def sides(self, frames: Frames) -> Sides:
+        return self.sides_of(Placed(frames.origin[self.index], frames.rotation[self.index]))
+
+    def sides_of(self, placed: Placed) -> Sides:
+        """With the frames of the bodies to which they belong, `(2, k, ...)`."""
+        at = placed.origin + turn(placed.rotation, self.points)
+        axes = compose(placed.rotation, self.axes)
+        return Sides(at[0], at[1], axes[0], axes[1])
+
+    def velocities(self, frames: Frames, sides: Sides) -> Float[Array, "k 3"]:
+        """Of the second points against the first."""
+        arms = jnp.stack([sides.first, sides.second]) - frames.origin[self.index]
+        moving = frames.velocity[self.index] + jnp.cross(frames.spin[self.index], arms)
+        return moving[1] - moving[0]
+
+
+def attach(
+    bodies: Bodies, things: Sequence[Any], names: Sequence[str], axes: Sequence[Any] | None = None
+) -> Attachment:
+    """Points and frames of the drawing in the frames of the bodies; `axes` are pairs."""
+    first, second = zip(
+        *[_indices(bodies, t, name) for t, name in zip(things, names, strict=True)], strict=True
+    )
+    pairs = [_ends(bodies, t, i, name) for t, i, name in zip(things, first, names, strict=True)]
+    is_drawn = np.array([pair[0] for pair in pairs])
+    given = stack([stack([pair[side] for pair in pairs]) for side in (1, 2)])
+    upright = np.array([0.0, 0.0, 1.0])
+    axes = [(upright, upright)] * len(things) if axes is None else axes
+    given_axes = stack([stack([pair[side] for pair in axes]) for side in (0, 1)])
+    index = first, second
+    points, frames = _in_bodies(bodies.drawing, np.asarray(index), given, is_drawn, given_axes)
+    return Attachment(tuple(names), index, points, frames)
+
+
+@jax.jit  # one program, not one for each operation
+def _in_bodies(
+    drawing: Pose, index: Any, given: Array, is_drawn: Any, axes: Array
+) -> tuple[Float[Array, "2 k 3"], Float[Array, "2 k 3 3"]]:
+    origin, rotation = Placed.of_rows(with_ground(drawing)[index], drawing.planar)
+    given = in_space(given)
+    in_body = turn_back(rotation, given - origin)
+    frames = compose(jnp.swapaxes(rotation, -1, -2), basis(axes))
+    return jnp.where(is_drawn[None, :, None], in_body, given), frames
+
+
+def _ends(bodies: Bodies, thing: Any, first: int, name: str) -> tuple[bool, Any, Any]:
+    if isinstance(thing, joints.Fixed) and thing.at is None and thing.points is None:
+        if first == len(bodies.names):
+            first = bodies.index(thing.second, name)
+        at = bodies.drawing.position[first]
+        return True, at, at
+    return joints.ends(thing, name, bodies.planar)
+
+
+def _indices(bodies: Bodies, thing: Any, name: str) -> tuple[int, int]:
+    if thing.first == thing.second:
+        raise ValueError(
+            f"{name} connects {thing.first!r} with itself. Give two bodies, or `mj.multibody.GROUND`."
+        )
+    return bodies.index(thing.first, name), bodies.index(thing.second, name)
+
+
+def name_all(given: Any, base: type, what: str) -> tuple[list[Any], tuple[str, ...]]:
+    """All joints or forces and their names, those that have none made of kind and bodies."""
+    things = check_sequence(f"{what}s", given, base, f"{what}s of `mj.multibody`")
+    names, count = [], {}
+    for thing in things:
+        name = thing.name
+        if name is None:
+            own = [getattr(thing, part, None) for part in ("first", "second", "body", "joint")]
+            name = " ".join([type(thing).__name__, "-".join(str(part) for part in own if part)])
+            count[name] = count.get(name, 0) + 1
+            name = name if count[name] == 1 else f"{name} ({count[name]})"
+        names.append(name)
+    return things, unique_names(what, names)
