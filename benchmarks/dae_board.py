@@ -5,12 +5,14 @@
 For each: what the reduction found, digits against the published (or elementary) solution at the end,
 steps, run time, how far constraints are violated there; the derivative of the unknowns by a parameter
 in both modes and by differences; and IDA (scikit-sundae) and Radau (scipy_dae), where installed, on
-the same residual. `--quick` leaves out derivatives and other libraries.
+the same residual. `--quick` leaves out derivatives and other libraries. With `--problems`, the rows of
+other problems that are in the file FILE are kept.
 """
 
 import dataclasses
 import time
 from collections.abc import Callable
+from json import loads as read_json
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -143,6 +145,18 @@ def _last(solve: Callable) -> Callable:
     return last
 
 
+def _rows_in(path: Path | None) -> dict[str, Row]:
+    """Of an earlier run."""
+    if path is None or not path.exists():
+        return {}
+    rows = read_json(path.read_text())["problems"]
+    timings = [None if row["run"] is None else Timing(**row["run"]) for row in rows]
+    return {
+        row["problem"]: Row(**{**row, "run": timing})
+        for row, timing in zip(rows, timings, strict=True)
+    }
+
+
 def print_table(console: Console, rows: list[Row]) -> None:
     table = Table(
         "problem",
@@ -228,10 +242,11 @@ def main(
     for name, title in PEERS.items():
         if not quick and name not in installed():
             console.print(f"{title}: skipped. It needs {name}: `pip install '.[peers]'`")
-    rows = []
+    every = _rows_in(json) if problems else {}
     for name in names:
-        rows.append(measure(name, made[name], repeats, quick))
-        print_table(console, rows[-1:])
+        every[name] = measure(name, made[name], repeats, quick)
+        print_table(console, [every[name]])
+        rows = [every[name] for name in made if name in every]
         if json is not None:
             content = {
                 "environment": environment("scikit-sundae", "scipy_dae", "casadi"),
