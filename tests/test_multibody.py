@@ -522,7 +522,10 @@ A, B = spatial("a"), spatial("b")
         (lambda: mb.Assembly([A], mb.Spherical("a", "b", at=(0, 0, 0))), "`joints` must be a sequence"),
         (lambda: mb.Assembly([A], [], None), "`forces` must be a sequence"),
         (lambda: joint(mb.Spherical("a", "b", at=(0, 0, 0), name=3)), "`name` of a joint must be a string"),
-        (lambda: joint(mb.Spherical("a", "b", at=(0, 0, 0), axis=(1, 0, 0))), "a Spherical has no `axis`"),
+        (
+            lambda: mb.Assembly([mb.Body("p", 1.0, 1.0)], [mb.Revolute("p", "ground", at=(0, 0), axis=(0, 0, 1))]),
+            "a Revolute in the plane has no `axis`",
+        ),
         (lambda: joint(mb.Distance("a", "b", ((0, 0, 0), (1, 0, 0)), "long")), "`length` must be a number"),
         (lambda: joint(mb.Distance("a", "b", ((0, 0, 0), (1, 0, 0)), np.inf)), "`length` must be finite"),
         (lambda: force(mb.Spring("a", "b", np.nan, between=((0, 0, 0), (1, 0, 0)))), "`stiffness` must be finite"),

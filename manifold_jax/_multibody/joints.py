@@ -31,7 +31,27 @@ class AbstractJoint(eqx.Module):
 
 
 class AbstractPointJoint(AbstractJoint):
-    """A joint at one point, of which the kind says what its `axis` is, if it has one."""
+    """A joint at one point."""
+
+    at: eqx.AbstractVar[Any]
+
+    @property
+    def drawn(self):
+        return None if self.at is None else (self.at, self.at)
+
+
+class AbstractJointWithoutAxis(AbstractPointJoint):
+    """Its fields."""
+
+    first: str = eqx.field(static=True)
+    second: str = eqx.field(static=True)
+    at: Any = None
+    points: Any = None
+    name: str | None = eqx.field(static=True, default=None)
+
+
+class AbstractJointWithAxis(AbstractPointJoint):
+    """The kind says what its `axis` is."""
 
     first: str = eqx.field(static=True)
     second: str = eqx.field(static=True)
@@ -40,12 +60,8 @@ class AbstractPointJoint(AbstractJoint):
     points: Any = None
     name: str | None = eqx.field(static=True, default=None)
 
-    @property
-    def drawn(self):
-        return None if self.at is None else (self.at, self.at)
 
-
-class Revolute(AbstractPointJoint):
+class Revolute(AbstractJointWithAxis):
     """A hinge: one point in common, and in space the direction `axis`. Two equations in the plane,
     where it has no axis, five in space.
 
@@ -57,22 +73,22 @@ class Revolute(AbstractPointJoint):
     """
 
 
-class Spherical(AbstractPointJoint):
+class Spherical(AbstractJointWithoutAxis):
     """A ball joint: one point in common, three equations; in space only. Arguments as for
     [`Revolute`][], without an axis."""
 
 
-class Prismatic(AbstractPointJoint):
+class Prismatic(AbstractJointWithAxis):
     """A slider: it moves along `axis` and does not turn, as in the drawing. Two equations in the
     plane, five in space. Arguments as for [`Revolute`][]; `axis` has shape `(2,)` in the plane."""
 
 
-class Cylindrical(AbstractPointJoint):
+class Cylindrical(AbstractJointWithAxis):
     """Sliding along `axis` and turning about it: four equations; in space only. Arguments as for
     [`Revolute`][]."""
 
 
-class Universal(AbstractPointJoint):
+class Universal(AbstractJointWithAxis):
     """A Cardan joint: one point in common, and two axes that stay perpendicular, the first fixed in
     the first body, the second in the second: four equations; in space only.
 
@@ -80,7 +96,7 @@ class Universal(AbstractPointJoint):
     """
 
 
-class Fixed(AbstractPointJoint):
+class Fixed(AbstractJointWithoutAxis):
     """A weld: no motion against the drawing. Three equations in the plane, six in space.
 
     **Arguments:** as for [`Revolute`][], without an axis; `at` is where joint forces are told, by
