@@ -36,12 +36,10 @@ def energies(case, y):
     problem, (q, v) = case.problem, y
     if case.height is None:
         return np.array([energy(row, problem.args) for row in zip(q, v)])
-    masses = problem.system.mass_matrix.function(q[0], problem.args)
-    weight = problem.args.mass * problem.args.gravity
-    kinetic = 0.5 * masses * v**2
-    return kinetic.reshape(len(q), -1).sum(1) + weight * q[..., case.height].reshape(
-        len(q), -1
-    ).sum(1)
+    masses = np.asarray(problem.system.mass_matrix.function(jnp.asarray(q[0]), problem.args))
+    weight = float(problem.args.mass * problem.args.gravity)
+    every = lambda x: np.asarray(x).reshape(len(q), -1).sum(axis=1)
+    return every(0.5 * masses * v**2) + weight * every(q[..., case.height])
 
 
 @pytest.mark.parametrize("build", CASES.values(), ids=CASES)
