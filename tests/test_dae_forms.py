@@ -251,7 +251,7 @@ def test_index_one_on_the_manifold():
     assert mj.constraint_violation(dae.constraint, 1.0, z, args) < 1e-14
 
 
-def test_forms():
+def test_forms(as_a_user_meets_it):
     with pytest.raises(ValueError, match="`form` must be 'ode' or 'index-1', got 'index-3'"):
         mj.reduce_dae(models.rlc_series, jnp.ones(4), models.RLC_ARGS, form="index-3")
 
