@@ -97,8 +97,10 @@ def reduce_dae(
     Structure cannot see what cancels. Where the highest derivatives cancel in a combination of
     equations with constant weights, as in circuits with loops of capacitors, `M x' = f(t, x)` with
     a constant singular matrix, the combination takes the place of one of them (`report.equations`
-    says which). Other cancellations are refused. For mechanisms [`MechanicalSystem`][] compiles to less and corrects positions and
-    velocities in the metric of the masses.
+    says which). Their coefficients may vary if they are added and subtracted as one number, like
+    the charge or the current between two nodes. Other cancellations are refused. For mechanisms
+    [`MechanicalSystem`][] compiles to less and corrects positions and velocities in the metric of
+    the masses.
 
     Source: J. D. Pryce, A simple structural analysis method for DAEs, BIT 41 (2001) 364-394.
     """
