@@ -164,7 +164,9 @@ def test_bad_arguments():
     with pytest.raises(ValueError, match="`further_constraint` is for the states of `further`"):
         mj.MechanicalSystem(1.0, rod, lambda t, q, v, args: q, further_constraint=COMPASS)
     built = system()
-    with pytest.raises(ValueError, match=r"`y` must be the tuple `\(q, v, z\)`.* of 2"):
+    with pytest.raises(
+        ValueError, match=r"`y` must be the tuple `\(q, v, z\)`.*got shapes \(\(2,\), \(2,\)\)"
+    ):
         solve(built, mj.Projected(dfx.Tsit5(), built.constraint), y0=START[:2])
     wrong = mj.MechanicalSystem(
         1.0, rod, torque_and_weight, further=lambda t, q, v, z, args: z["motor"]

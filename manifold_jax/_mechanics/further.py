@@ -76,8 +76,7 @@ def split(y: Y) -> tuple[tuple[Y, Y], Y]:
     if not (isinstance(y, tuple) and len(y) == 3):
         raise ValueError(
             "`y` must be the tuple `(q, v, z)` of positions, velocities and the further states of a mechanical "
-            f"system with `further`, got {type(y).__name__}"
-            f"{f' of {len(y)}' if isinstance(y, tuple) else ''}. Write e.g. `y0 = (q0, jnp.zeros_like(q0), z0)`."
+            f"system with `further`, got shapes {jtu.tree_map(jnp.shape, y)}. Write e.g. `y0 = (q0, jnp.zeros_like(q0), z0)`."
         )
     q, v, z = y
     return (q, v), z

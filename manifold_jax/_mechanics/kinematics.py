@@ -149,8 +149,8 @@ def check_mechanical_state(y: Y) -> tuple[Any, Any]:
     """Refuse, while tracing, states that are not `(q, v)`."""
     if not (isinstance(y, tuple) and len(y) == 2):
         raise ValueError(
-            "`y` must be the tuple `(q, v)` of positions and velocities of a mechanical system, got "
-            f"{type(y).__name__}. Write e.g. `y0 = (q0, jnp.zeros_like(q0))`."
+            "`y` must be the tuple `(q, v)` of positions and velocities of a mechanical system, got shapes "
+            f"{jtu.tree_map(jnp.shape, y)}. Write e.g. `y0 = (q0, jnp.zeros_like(q0))`."
         )
     q, v = y
     shapes = lambda tree: jtu.tree_map(jnp.shape, tree)
