@@ -193,9 +193,7 @@ def test_energy_of_the_polymer():
     np.testing.assert_allclose(problem.reference(1.0)[1].sum(0), problem.y0[1].sum(0), atol=1e-10)
 
 
-@pytest.mark.parametrize(
-    "loops", [2, *(pytest.param(n, marks=pytest.mark.slow) for n in (5, 40))]
-)
+@pytest.mark.parametrize("loops", [2, *(pytest.param(n, marks=pytest.mark.slow) for n in (5, 40))])
 def test_near_a_singular_position(loops):
     """Equations that nearly depend on each other, `angle^2` of the largest eigenvalue: accelerations
     are those of one angle, or NaN. Dense matrices leave errors of some `eps / angle^2`."""
