@@ -21,6 +21,7 @@ LAYERS = [
         "_errors",
         "_extras",
         "_terminal_bar",
+        "_traced_length",
         "_user_function",
         "_rejection",
     },

@@ -120,7 +120,8 @@ def ring_modulator(t, y, rate, a):
 
 @pytest.mark.slow
 def test_ring_modulator():
-    """Against SciPy's Radau at 1e-7 with capacitors of 2e-12 and 2e-13, extrapolated to none: the
+    """Problem `ring modulator` of Mazzia & Magherini, Test Set for Initial Value Problem Solvers
+    (2008): of index 2 for `Cs = 0`. Against SciPy's Radau at 1e-7 with capacitors of 2e-12 and 2e-13, extrapolated to none: the
     voltages and the current that do not oscillate for longer the smaller the capacitors are."""
     dae = mj.reduce_dae(ring_modulator, jnp.zeros(15), form="index-1")
     assert (dae.report.index, dae.report.degrees_of_freedom) == (2, 10)
@@ -276,3 +277,6 @@ def test_equations_that_need_their_multiplier():
     np.testing.assert_allclose(dae.outputs(0.0, y, a)[0]["force"], 9.81, rtol=1e-12)
     _, xdot = dae.outputs(0.0, y, a)
     np.testing.assert_allclose(xdot["v"][0], 1 - 0.2 * 9.81, rtol=1e-12)
+    without_force = y.at[4].set(0.0)
+    slopes = jax.jacrev(lambda y: dae.constraint(0.0, y, a))(without_force)
+    np.testing.assert_allclose(slopes @ y, [y[1], y[3]], atol=1e-15)

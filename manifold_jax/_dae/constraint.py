@@ -71,12 +71,13 @@ def hidden_constraints(
     w: Array | None = None,
 ) -> Float[Array, " m"]:
     """`F_i^(k)` for `first_i <= k < end_i`. Leading derivatives `w` like those that belong to `z` are
-    for the size of what cancels."""
+    for the size of what cancels in combinations of equations. Without these the example serves better:
+    there all that these equations do not depend on is known to be finite, with its slopes."""
     plan, t = system.static.plan, as_time(t, z.dtype)
     rows, order = plan.layout.aliases.rows, int(end.max(initial=0)) - 1
     if order < 0:
         return jnp.zeros((0,), z.dtype)
-    jets = plan.jets_of_states(z, w, order)
+    jets = plan.jets_of_states(z, w if system.equations.combinations else None, order)
     levels = total_derivatives(system.equations, t, jets, args, order)
     parts = [pick(levels[k], rows[(first <= k) & (k < end)]) for k in range(order + 1)]
     return jnp.concatenate(parts)

@@ -2,14 +2,21 @@
 
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
+import jax.tree_util as jtu
 from jaxtyping import Array, Float
 
 from .._custom_types import BoolScalar
-from .elimination import factorize_pivoted
+from .._traced_length import num_equations
+from .elimination import factorize_pivoted, PivotedFactorization
 from .mass_matrix import product
 from .system import System, Vector
 from .tableau import RosenbrockTableau, Row
+
+
+# Equations of the vector field times stages.
+LARGEST_UNROLLED = 500
 
 
 class RosenbrockStep(NamedTuple):
@@ -46,25 +53,8 @@ def rosenbrock_step(
     f0, J, T = system.linearized(x0, Z0)
     M0 = system.mass_at(system.t0, x0)
     factor = factorize_pivoted(_iteration_matrix(M0, tableau.gamma, J), largest_written_out)
-    U: list[Vector] = []
-    V: list[Vector] = []
-    known = {((), 0.0): (f0, M0)}
-    for i, c in enumerate(tableau.c):
-        row = _without_zeros(tableau.a_lower[i - 1] if i > 0 else ())
-        if (row, c) not in known:  # some methods have stages at the same point
-            t, x = system.time(c), _plus(x0, row, U)
-            known[row, c] = system.increment(t, x), M0 if Z0 is None else system.mass_at(t, x)  # pyright: ignore[reportArgumentType]
-        f, M = known[row, c]  # pyright: ignore[reportArgumentType]
-        coupling = _plus(None, tableau.c_lower[i - 1] if i > 0 else (), U)
-        right = f if tableau.d[i] == 0 else f + tableau.d[i] * T
-        if coupling is not None:
-            right = right + (coupling if M0 is None else product(M0, coupling))
-        if Z0 is None:
-            U.append(factor.solve(right))
-            continue
-        Z = _plus(Z0, row, V)
-        U.append(factor.solve(right - product(M - M0, Z)))  # pyright: ignore[reportOperatorIssue]
-        V.append(U[i] / tableau.gamma - Z - (0 if coupling is None else coupling))
+    stages = _Stages(tableau, system, factor, x0, Z0, M0, T)
+    U, V = stages.in_a_loop(f0) if stages.are_long else stages.written_out(f0)
     finite = [jnp.all(jnp.isfinite(value)) for value in (f0, J, T)]
     # A finished lane of a batch makes steps of no length.
     after = None if Z0 is None else _plus(Z0, tableau.m, V) / jnp.where(h == 0, 1, h)
@@ -76,6 +66,79 @@ def rosenbrock_step(
         finite[0] & finite[1] & finite[2],
         factor.regular,
     )
+
+
+class _Stages(NamedTuple):
+    """What the stages of one step share."""
+
+    tableau: RosenbrockTableau
+    system: System
+    factor: PivotedFactorization
+    x0: Vector
+    Z0: Vector | None
+    M0: Float[Array, "..."] | None
+    T: Vector
+
+    @property
+    def are_long(self) -> bool:
+        increment = num_equations(self.system.increment, jnp.asarray(self.system.t0), self.x0)
+        return increment * len(self.tableau.c) > LARGEST_UNROLLED
+
+    def evaluate(self, t: Array, x: Vector) -> tuple[Vector, Any]:
+        """`h f` and `M`."""
+        constant = self.Z0 is None
+        M = self.M0 if constant else self.system.mass_at(t, x)
+        return self.system.increment(t, x), M
+
+    def solve(
+        self, f: Vector, M: Any, d: Any, coupling: Vector | None, Z: Vector | None
+    ) -> tuple[Vector, Vector | None]:
+        """`U_i` and `V_i`."""
+        right = f if isinstance(d, float) and d == 0 else f + d * self.T
+        if coupling is not None:
+            right = right + (coupling if self.M0 is None else product(self.M0, coupling))
+        if Z is None:
+            return self.factor.solve(right), None
+        U = self.factor.solve(right - product(M - self.M0, Z))  # pyright: ignore[reportOperatorIssue]
+        return U, U / self.tableau.gamma - Z - (0 if coupling is None else coupling)
+
+    def written_out(self, f0: Vector) -> tuple[list[Vector], list[Any]]:
+        tableau = self.tableau
+        U: list[Vector] = []
+        V: list[Any] = []
+        known = {((), 0.0): (f0, self.M0)}
+        for i, c in enumerate(tableau.c):
+            row = _without_zeros(tableau.a_lower[i - 1] if i > 0 else ())
+            if (row, c) not in known:  # some methods have stages at the same point
+                known[row, c] = self.evaluate(self.system.time(c), _plus(self.x0, row, U))
+            coupling = _plus(None, tableau.c_lower[i - 1] if i > 0 else (), U)
+            Z = None if self.Z0 is None else _plus(self.Z0, row, V)
+            for values, new in zip((U, V), self.solve(*known[row, c], tableau.d[i], coupling, Z)):
+                values.append(new)
+        return U, V
+
+    def in_a_loop(self, f0: Vector) -> tuple[list[Vector], list[Any]]:
+        """The same with the vector field compiled once, whatever the number of stages."""
+        tableau, count = self.tableau, len(self.tableau.c)
+        dtype = self.x0.dtype
+
+        def stage(known: Any, xs: Any) -> tuple[Any, None]:
+            i, t, row, couplings, d = xs
+            f, M = self.evaluate(t, self.x0 + row @ known[0])
+            Z = None if self.Z0 is None else self.Z0 + row @ known[1]
+            new = self.solve(f, M, d, couplings @ known[0], Z)
+            return jtu.tree_map(lambda values, value: values.at[i].set(value), known, new), None
+
+        first = self.solve(f0, self.M0, tableau.d[0], None, self.Z0)
+        start = jtu.tree_map(lambda u: jnp.zeros((count, *u.shape), dtype).at[0].set(u), first)
+        padded = lambda rows: jnp.asarray(
+            [(*row, *[0.0] * (count - len(row))) for row in rows], dtype
+        )
+        times = jnp.stack([self.system.time(c) for c in tableau.c[1:]])
+        d = jnp.asarray(tableau.d[1:], dtype)
+        xs = (jnp.arange(1, count), times, padded(tableau.a_lower), padded(tableau.c_lower), d)
+        U, V = jax.lax.scan(stage, start, xs)[0]
+        return list(U), [] if V is None else list(V)
 
 
 def _iteration_matrix(

@@ -11,7 +11,6 @@ from typing import Any, NamedTuple
 
 import diffrax as dfx
 import jax
-import jax.extend.core as jax_core
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
@@ -20,6 +19,7 @@ from jaxtyping import Array
 
 from .._custom_types import Args, RealScalarLike, Y
 from .._projection_info import ProjectionInfo
+from .._traced_length import num_equations
 from .frame import Frame
 
 
@@ -93,7 +93,7 @@ def explicit_step(
     inner_rows = rows[:-1] if fsal else rows
     increment = lambda t, w: frame.terms.prod(at_stage(t, w), control)
     if in_a_loop is None:
-        length = num_equations(jax.make_jaxpr(at_stage)(jnp.asarray(t0), w0).jaxpr)
+        length = num_equations(at_stage, jnp.asarray(t0), w0)
         in_a_loop = length * (len(inner_rows) + 1) > LARGEST_UNROLLED and bool(inner_rows)
     evaluate = _stages_in_a_loop if in_a_loop else _stages
     increments = evaluate(inner_rows, times[: len(inner_rows)], increment, w0, first)
@@ -137,16 +137,6 @@ def _stages_in_a_loop(
     buffer, _ = jax.lax.scan(stage, buffer, xs)
     take = lambda i: jtu.tree_map(lambda k: k[i], buffer)
     return [take(i) for i in range(count)]
-
-
-def num_equations(jaxpr: Any) -> int:
-    """The length of a traced function, inner functions included."""
-    total = 0
-    for equation in jaxpr.eqns:
-        total += 1
-        for inner in jax_core.jaxprs_in_params(equation.params):
-            total += num_equations(inner)
-    return total
 
 
 @jax.custom_jvp
