@@ -96,10 +96,11 @@ def two_bit_adder() -> BoardProblem:
         {"load": 2.0},
         320.0,
         {"u": end},
-        "",
+        "load",
         rtol=1e-5,
         atol=1e-5,
         floor=1.0,
         jumps=tuple(np.arange(5.0, 320.0, 5.0)),
         form="index-1",
+        short=5.0,
     )

@@ -27,6 +27,7 @@ from rich.table import Table
 import manifold_jax as mj
 from manifold_jax._adjoint import sizes
 from manifold_jax._solver import explicit
+from manifold_jax._traced_length import num_equations
 
 from ._measure import (
     compiled,

@@ -39,6 +39,24 @@ def _bounded_mappings():
 
 
 @pytest.fixture
+def missing_entry(monkeypatch):
+    """As if a rule of the walk through the constraint were wrong: equation 5 not known to depend on
+    unknown 0."""
+    from manifold_jax._sparse import structure  # not before the type checks are in place
+
+    exact = structure.dependence
+
+    def wrong(function, x):
+        depends = exact(function, x).tolil()
+        assert depends[5, 0]
+        depends[5, 0] = False
+        return depends.tocsr()
+
+    monkeypatch.setattr(structure, "dependence", wrong)
+    monkeypatch.setattr(structure, "_FOUND", {})
+
+
+@pytest.fixture
 def as_a_user_meets_it():
     """Without the runtime type checks of the tests, which would answer before the library."""
     jaxtyping.config.update("jaxtyping_disable", True)

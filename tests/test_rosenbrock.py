@@ -16,6 +16,7 @@ from benchmarks._stiff_problems import (
     stiff_mechanism,
     stiff_mechanism_reference,
 )
+from manifold_jax._rosenbrock import stages
 
 
 METHODS = {"Rodas5P": mj.Rodas5P(), "Rodas3P": mj.Rodas3P()}
@@ -161,6 +162,37 @@ def test_orders(name, case, order, steps):
         errors.append(np.linalg.norm(y1 - end))
     assert errors[-1] > 1e-13
     assert abs(np.log2(errors[0] / errors[1]) - order) <= 0.2, errors
+
+
+@pytest.mark.parametrize(
+    ("name", "case"),
+    [
+        ("Rodas5P", constant_singular),
+        ("Rodas5P", varying_singular),
+        pytest.param("Rodas3P", plain, marks=pytest.mark.slow),
+        pytest.param("Rodas3P", varying_regular, marks=pytest.mark.slow),
+    ],
+)
+def test_stages_in_a_loop(name, case, monkeypatch):
+    """Of long vector fields, with derivatives: as those that are written out."""
+    terms, y0, _ = case(0.9)
+    y0 = jnp.asarray(y0)
+
+    def step(y0, h):
+        solver = METHODS[name]
+        state = solver.init(terms, 0.2, 0.2 + h, y0, None)
+        y1, error, info, _, _ = solver.step(terms, 0.2, 0.2 + h, y0, None, state, False)
+        return jnp.concatenate([y1, error, *info["k"]])
+
+    results = []
+    for limit in (0, 10**9):
+        monkeypatch.setattr(stages, "LARGEST_UNROLLED", limit)
+        both = lambda y0, h: (step(y0, h), jax.jacrev(step, (0, 1))(y0, h))
+        traced = jax.jit(both).trace(y0, jnp.asarray(0.1))
+        assert ("scan" in str(traced.jaxpr)) == (limit == 0)
+        results.append(traced.lower().compile()(y0, jnp.asarray(0.1)))
+    for in_a_loop, written_out in zip(*map(jax.tree.leaves, results)):
+        np.testing.assert_allclose(in_a_loop, written_out, rtol=1e-11, atol=1e-12)
 
 
 @pytest.mark.parametrize(("name", "order"), [("Rodas5P", 3), ("Rodas3P", 2)])

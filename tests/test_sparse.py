@@ -275,18 +275,8 @@ def test_dependent_equations_are_refused_at_the_start():
         mj.consistent_state(dependent.constraint, 0.0, problem.y0, problem.args)
 
 
-def test_a_missing_entry_is_noticed(monkeypatch):
-    """As if a rule of the walk through the constraint were wrong."""
-    exact = structure.dependence
-
-    def wrong(function, x):
-        depends = exact(function, x).tolil()
-        assert depends[5, 0]
-        depends[5, 0] = False
-        return sp.csr_matrix(depends)
-
-    monkeypatch.setattr(structure, "dependence", wrong)
-    monkeypatch.setattr(structure, "_FOUND", {})
+@pytest.mark.usefixtures("missing_entry")
+def test_a_missing_entry_is_noticed():
     system, problem = chain(6, "sparse")
     closed = lambda t, q, args: system.holonomic(t, q, args).at[5].add(q[0])
     ring = mj.MechanicalSystem(system.mass_matrix, closed, system.force, structure="sparse")

@@ -5,10 +5,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import scipy.sparse as sp
 
 import manifold_jax as mj
-from manifold_jax._sparse import structure
 from manifold_jax.problems.n_four_bar import _bodies
 from manifold_jax.problems.polymer import energy, polymer
 
@@ -103,17 +101,8 @@ def test_spheres_that_have_nothing_in_common():
     np.testing.assert_allclose(p, y / jnp.linalg.norm(y, axis=1)[:, None], rtol=0, atol=1e-14)
 
 
-def test_a_missing_entry_is_noticed(monkeypatch):
-    exact = structure.dependence
-
-    def wrong(function, x):
-        depends = exact(function, x).tolil()
-        assert depends[5, 0]
-        depends[5, 0] = False
-        return sp.csr_matrix(depends)
-
-    monkeypatch.setattr(structure, "dependence", wrong)
-    monkeypatch.setattr(structure, "_FOUND", {})
+@pytest.mark.usefixtures("missing_entry")
+def test_a_missing_entry_is_noticed():
     ring = lambda t, y, args: (y * jnp.roll(y, 1) - 1).at[5].add(y[0])
     y = 1 + 0.1 * jnp.sin(jnp.arange(8.0))
     _, info = mj.project(mj.Constraint(ring, structure="sparse"), 0.0, y, throw=False)

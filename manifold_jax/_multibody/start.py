@@ -130,9 +130,11 @@ class _Host:
         self.check_positions(x, "")
         _, J = self(x)
         rate = np.abs(J @ w)
-        if not rate.max(initial=0) <= _closed(x) * max(1, np.abs(w).max()):
+        most = _closed(x) * max(1, np.abs(w).max())
+        if not rate.max(initial=0) <= most:
+            worst = self._worst(rate, most, "m/s")
             raise ValueError(
-                f"The velocities do not agree with the joints: {self._worst(rate, 'm/s')}. Give only those that are known, "
+                f"The velocities do not agree with the joints: {worst}. Give only those that are known, "
                 "such that joints allow them, and `assemble=True`."
             )
         if not self.assembly.redundant:
@@ -147,13 +149,13 @@ class _Host:
                 else " Give `assemble=True` to close them, or correct positions and orientations."
             )
             raise ValueError(
-                f"The state does not satisfy the joints: {self._worst(gap, 'm')}.{advice}"
+                f"The state does not satisfy the joints: {self._worst(gap, _closed(x), 'm')}.{advice}"
             )
 
-    def _worst(self, size: np.ndarray, unit: str) -> str:
+    def _worst(self, size: np.ndarray, most: float, unit: str) -> str:
         largest = [size[rows].max() for _, rows in self._rows()]
         order = np.argsort(largest)[::-1][:5]
-        worst = [(self._rows()[i][0], largest[i]) for i in order if not largest[i] <= CLOSED]
+        worst = [(self._rows()[i][0], largest[i]) for i in order if not largest[i] <= most]
         return ", ".join(f"{name} (gap {gap:.3g} {unit})" for name, gap in worst)
 
     def _rows(self) -> list[tuple[str, np.ndarray]]:

@@ -142,10 +142,12 @@ def is_small(correction: FloatScalar) -> BoolScalar:
 
 class _Iterate(NamedTuple):
     x: Float[Array, " n"]
-    step: Float[Array, " n"]
+    step: Float[Array, " n"]  # from there, not known before the first iteration
     size: FloatScalar  # of the step
     previous: FloatScalar
     iterations: IntScalar
+    finite: BoolScalar  # whether the equations are defined at the start
+    regular: BoolScalar
 
 
 def consistent(
@@ -157,21 +159,30 @@ def consistent(
     """
     unit = 4 * jnp.finfo(x.dtype).eps
     fixed, t_fixed = jax.lax.stop_gradient((x, t))
-    start = equations.at(t_fixed, fixed)
-
-    def iterate(x, previous, iterations):
-        step = jax.lax.stop_gradient(equations.at(t_fixed, x).newton)
-        return _Iterate(x, step, relative_size(step, x), previous, iterations)
 
     def unfinished(i: _Iterate):
         shrinking = (i.size < i.previous) | (i.iterations < 10)
         return (i.size > unit) & shrinking & (i.iterations < _MOST_ITERATIONS)
 
     def advance(i: _Iterate):
-        return iterate(i.x + i.step, i.size, i.iterations + 1)
+        x, at_start = i.x + i.step, i.iterations < 0
+        linearized = equations.at(t_fixed, x)
+        return _Iterate(
+            x,
+            linearized.newton,
+            relative_size(linearized.newton, x),
+            i.size,
+            i.iterations + 1,
+            jnp.where(at_start, linearized.finite, i.finite),
+            jnp.where(at_start, linearized.regular, i.regular),
+        )
 
-    first = iterate(fixed, jnp.asarray(jnp.inf, x.dtype), jnp.zeros((), jnp.int32))
-    end = jax.lax.while_loop(unfinished, advance, first)
+    unknown, yes = jnp.asarray(jnp.inf, x.dtype), jnp.asarray(True)
+    # Compiled once: the start, too, is met in the loop.
+    before = _Iterate(
+        fixed, jnp.zeros_like(fixed), unknown, unknown, jnp.asarray(-1, jnp.int32), yes, yes
+    )
+    end = jax.lax.while_loop(unfinished, advance, before)
     success = end.size <= 1e3 * unit
     moved = jax.lax.stop_gradient(jnp.where(success, end.x, fixed))
     there = equations.at(t, moved)
@@ -180,11 +191,9 @@ def consistent(
     info = ProjectionInfo(
         multipliers=jnp.zeros((0,), x.dtype),
         iterations=end.iterations,
-        residual=jnp.where(
-            start.finite, jnp.where(jnp.isnan(end.size), jnp.inf, end.size), jnp.nan
-        ),
+        residual=jnp.where(end.finite, jnp.where(jnp.isnan(end.size), jnp.inf, end.size), jnp.nan),
         correction=relative_size(moved - fixed, fixed),
-        full_rank=start.regular,
+        full_rank=end.regular,
         success=success,
     )
     return out, info

@@ -15,8 +15,10 @@ from .system import System, Vector
 from .tableau import RosenbrockTableau, Row
 
 
-# Equations of the vector field times stages.
-LARGEST_UNROLLED = 500
+# Equations of the vector field times stages. A loop over the stages of 6000 (transistor amplifier) and
+# 7600 equations (charge pump) takes 1.3 times as long in a batch, one of 20000 (wheelset) 0.75 times; that
+# compiles in 0.8 of the time, and its gradient in minutes at all. jaxlib 0.10.2.
+LARGEST_UNROLLED = 10_000
 
 
 class RosenbrockStep(NamedTuple):
@@ -113,7 +115,9 @@ class _Stages(NamedTuple):
                 known[row, c] = self.evaluate(self.system.time(c), _plus(self.x0, row, U))
             coupling = _plus(None, tableau.c_lower[i - 1] if i > 0 else (), U)
             Z = None if self.Z0 is None else _plus(self.Z0, row, V)
-            for values, new in zip((U, V), self.solve(*known[row, c], tableau.d[i], coupling, Z)):
+            for values, new in zip(
+                (U, V), self.solve(*known[row, c], tableau.d[i], coupling, Z), strict=True
+            ):
                 values.append(new)
         return U, V
 
