@@ -28,11 +28,12 @@ from ._dae import (
 from ._ensemble import (
     EnsembleSolution as EnsembleSolution,
     open_ensemble as open_ensemble,
-    solve_ensemble as solve_ensemble,
     StoredEnsemble as StoredEnsemble,
-    stream_ensemble as stream_ensemble,
 )
-from ._fit import fit as fit, FitResult as FitResult
+from ._ensemble.solve_ensemble import solve_ensemble as solve_ensemble
+from ._ensemble.stream_ensemble import stream_ensemble as stream_ensemble
+from ._fit import FitResult as FitResult
+from ._fit.fit import fit as fit
 from ._mechanics import (
     Baumgarte as Baumgarte,
     MechanicalSystem as MechanicalSystem,
@@ -46,7 +47,7 @@ from ._rosenbrock import (
     Rodas3P as Rodas3P,
     Rodas5P as Rodas5P,
 )
-from ._solve import diffeqsolve as diffeqsolve
+from ._solve.diffeqsolve import diffeqsolve as diffeqsolve
 from ._solver import (
     LocalCoordinates as LocalCoordinates,
     Projected as Projected,

@@ -15,7 +15,6 @@ from ._multibody import (
     JointSpring as JointSpring,
     LinearActuator as LinearActuator,
     Motor as Motor,
-    parametrized as parametrized,
     Pose as Pose,
     Prismatic as Prismatic,
     quaternion as quaternion,
@@ -26,3 +25,4 @@ from ._multibody import (
     Torque as Torque,
     Universal as Universal,
 )
+from ._multibody.parametrized import parametrized as parametrized

@@ -1,8 +1,10 @@
 """The site has a place for everything."""
 
+import ast
 import re
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 from documents import blocks_of, ROOT, run
@@ -30,6 +32,16 @@ def documented():
 
 def test_every_public_name_is_documented_once(documented):
     assert sorted(documented) == sorted(public_names())
+
+
+@pytest.mark.parametrize("interface", [mj, mj.multibody])
+def test_no_module_takes_the_place_of_what_it_defines(interface):
+    """`from ._fit import fit` is to the site what is in `_fit/fit.py`, not the function."""
+    tree = ast.parse(Path(interface.__file__).read_text())
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom) and node.module:
+            package = Path(mj.__file__).parent.joinpath(*node.module.split("."))
+            assert not [a.name for a in node.names if (package / f"{a.name}.py").exists()]
 
 
 def test_every_page_and_every_notebook_is_in_the_navigation():

@@ -23,5 +23,4 @@ from .joints import (
     Universal as Universal,
 )
 from .mujoco import from_mujoco as from_mujoco, state_of_mujoco as state_of_mujoco
-from .parametrized import parametrized as parametrized
 from .rotations import quaternion as quaternion
