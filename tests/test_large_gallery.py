@@ -14,7 +14,7 @@ from manifold_jax.problems.polymer import energy
 
 
 pytestmark = pytest.mark.slow
-STEPS = 40
+STEPS = 20
 
 
 class Case(NamedTuple):
@@ -26,7 +26,7 @@ class Case(NamedTuple):
 CASES = {
     "polymer": lambda: Case(mj.problems.polymer(100, t1=0.2), "stiffness", None),
     "cable-net": lambda: Case(mj.problems.cable_net(5, 20, t1=0.2), "gravity", 2),
-    "falling-truss": lambda: Case(mj.problems.falling_truss(50, t1=0.5), "gravity", 1),
+    "falling-truss": lambda: Case(mj.problems.falling_truss(50, t1=1.0), "gravity", 1),
     "n-four-bar": lambda: Case(mj.problems.n_four_bar(50, t1=0.4), "gravity", 1),
 }
 
@@ -51,7 +51,7 @@ def test_every_step_and_a_gradient(build):
         args = problem.args._replace(**{name: value})
         sol = mj.diffeqsolve(
             problem.terms,
-            mj.Projected(dfx.Dopri8(), problem.constraint),
+            mj.Projected(dfx.Tsit5(), problem.constraint),
             0.0,
             problem.t1,
             problem.t1 / STEPS,
@@ -68,7 +68,7 @@ def test_every_step_and_a_gradient(build):
     violation = mj.constraint_violation(problem.constraint, sol.ts, sol.ys, problem.args)
     assert jnp.max(violation) < 1e-15
     every = energies(case, jax.tree.map(np.asarray, sol.ys))
-    assert np.ptp(every) < 1e-9 * max(1.0, abs(every[0]))
+    assert np.ptp(every) < 1e-8 * max(1.0, abs(every[0]))
     h = 1e-3 * float(value)
     near, far = (program(value + k * h)[0][0] - program(value - k * h)[0][0] for k in (1, 2))
     np.testing.assert_allclose(slope, (8 * near - far) / (12 * h), rtol=1e-7)
