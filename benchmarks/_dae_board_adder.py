@@ -103,4 +103,5 @@ def two_bit_adder() -> BoardProblem:
         jumps=tuple(np.arange(5.0, 320.0, 5.0)),
         form="index-1",
         short=5.0,
+        short_tolerance=1e-7,
     )

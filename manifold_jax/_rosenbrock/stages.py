@@ -108,17 +108,16 @@ class _Stages(NamedTuple):
         tableau = self.tableau
         U: list[Vector] = []
         V: list[Any] = []
-        known = {((), 0.0): (f0, self.M0)}
+        known: dict[tuple[Row, float], Any] = {((), 0.0): (f0, self.M0)}
         for i, c in enumerate(tableau.c):
             row = _without_zeros(tableau.a_lower[i - 1] if i > 0 else ())
             if (row, c) not in known:  # some methods have stages at the same point
                 known[row, c] = self.evaluate(self.system.time(c), _plus(self.x0, row, U))
             coupling = _plus(None, tableau.c_lower[i - 1] if i > 0 else (), U)
             Z = None if self.Z0 is None else _plus(self.Z0, row, V)
-            for values, new in zip(
-                (U, V), self.solve(*known[row, c], tableau.d[i], coupling, Z), strict=True
-            ):
-                values.append(new)
+            u, v = self.solve(*known[row, c], tableau.d[i], coupling, Z)
+            U.append(u)
+            V.append(v)
         return U, V
 
     def in_a_loop(self, f0: Vector) -> tuple[list[Vector], list[Any]]:

@@ -13,10 +13,10 @@ from .._multibody import (
     Distance,
     GROUND,
     JointSpring,
-    parametrized,
     Pose,
     Revolute,
 )
+from .._multibody.parametrized import parametrized
 from ._problem import as_floating, Problem
 from ._reduced import integrate
 

@@ -11,12 +11,12 @@ from .._multibody import (
     Body,
     GROUND,
     JointSpring,
-    parametrized,
     Pose,
     Prismatic,
     Spherical,
     Universal,
 )
+from .._multibody.parametrized import parametrized
 from ._problem import as_floating, Problem
 from ._reduced import integrate
 
