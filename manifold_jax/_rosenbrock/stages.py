@@ -115,7 +115,8 @@ class _Stages(NamedTuple):
                 known[row, c] = self.evaluate(self.system.time(c), _plus(self.x0, row, U))
             coupling = _plus(None, tableau.c_lower[i - 1] if i > 0 else (), U)
             Z = None if self.Z0 is None else _plus(self.Z0, row, V)
-            u, v = self.solve(*known[row, c], tableau.d[i], coupling, Z)
+            f, M = known[row, c]
+            u, v = self.solve(f, M, tableau.d[i], coupling, Z)
             U.append(u)
             V.append(v)
         return U, V
