@@ -17,7 +17,7 @@ from .tableau import RosenbrockTableau, Row
 
 # Equations of the vector field times stages. A loop over the stages of 6000 (transistor amplifier) and
 # 7600 equations (charge pump) takes 1.3 times as long in a batch, one of 20000 (wheelset) 0.75 times; that
-# compiles in 0.8 of the time, and its gradient in minutes at all. jaxlib 0.10.2.
+# compiles in 0.8 of the time. jaxlib 0.10.2.
 LARGEST_UNROLLED = 10_000
 
 
