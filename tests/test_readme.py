@@ -45,7 +45,7 @@ def check_dae(namespace):
 
 def check_many_and_gradients(namespace):
     """On the circle, and with the energy of each; d x(10) / d g is exact to the digits given."""
-    ensemble, start = namespace["ensemble"], np.asarray(namespace["drops"])
+    ensemble, start = namespace["ensemble"], np.asarray(namespace["starts"][0])
     q, v = (np.asarray(leaf[:, -1]) for leaf in ensemble.ys)
     np.testing.assert_allclose(np.sum(q**2, axis=-1), 1, rtol=0, atol=1e-15)
     energy = np.sum(v**2, axis=-1) / 2 + 9.81 * (q[:, 1] - start[:, 1])
