@@ -15,7 +15,8 @@ from .._compat import is_okay, messages_of_results, number_of_result
 class EnsembleSolution(eqx.Module):
     """Of `N` trajectories, in the order of the initial values.
 
-    - `ts`: the times of what was saved, `(N, T)`; infinite where a trajectory did not get there.
+    - `ts`: the times of what was saved, `(N, T)`; infinite where a trajectory did not get there, and with
+      `SaveAt(t1=True)` the time at which it stopped: see `failed`.
     - `ys`: the saved values, `(N, T, ...)`.
     - `stats`: as of [`diffeqsolve`][] without `max_steps`, each of shape `(N,)`.
     - `result`: the result codes of all trajectories.

@@ -86,8 +86,9 @@ def diffeqsolve(
 
     `TypeError` or `ValueError` for arguments that cannot work. With `throw=True` a
     `RuntimeError` where the solve fails; with `throw=False` look at `sol.result`:
-    `RESULTS.nonlinear_divergence` is a constraint that could not be satisfied, and
-    `RESULTS.nonfinite` a state that is NaN or infinite, also with a solver of Diffrax alone.
+    `RESULTS.nonlinear_divergence` is a constraint that could not be satisfied, or is NaN where it is
+    evaluated, and `RESULTS.nonfinite` a state that is NaN or infinite otherwise, with a constant step
+    size also for a solver of Diffrax alone.
 
     Source: Sudarsan & Keerthi, Appl. Math. Comput. 92 (1998) 153-193.
     """
