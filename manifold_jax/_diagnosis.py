@@ -11,6 +11,7 @@ from ._projection_info import ProjectionInfo
 
 
 NOT_THERE = 3  # the message for a state that may not be moved
+NOT_FINITE = 4
 
 _MESSAGES = (
     "`constraint` is not finite at the time and state given. Start from a state at which g(t, {y}, args) is "
@@ -22,6 +23,7 @@ _MESSAGES = (
     "closer to the manifold, or check that the equations can hold at the same time.",
     '`{y}` is not on the manifold. Write `consistent="project"` to have it moved there, or correct it first with '
     "`mj.consistent_state`.",
+    "`{y}` has numbers that are NaN or infinite. Start from a finite state.",
 )
 
 

@@ -45,6 +45,11 @@ def test_arguments_of_the_wrong_kind(arguments, message):
         solve(**arguments)
 
 
+def test_constant_steps_of_no_size():
+    with pytest.raises(ValueError, match=r"`dt0` is None.*diffrax.PIDController"):
+        solve(dt0=None)
+
+
 @pytest.mark.parametrize("dt0", [0, 0.0, float("nan")])
 def test_a_first_step_of_no_length(dt0):
     for solver in (PROJECTED, dfx.Tsit5()):

@@ -88,6 +88,21 @@ def test_starts_that_cannot_work(residual, message):
     assert not bool(info.success)
 
 
+@pytest.mark.parametrize("consistent", ["project", "check"])
+def test_a_start_that_is_not_finite(consistent):
+    """Also where the constraint does not see it."""
+    first = mj.Constraint(lambda t, y, args: y[0] - jnp.cos(t))
+    starts = jnp.array([[1.0, 0.0], [1.0, jnp.nan]])
+    options = dict(
+        consistent=consistent, dt0=None, stepsize_controller=dfx.PIDController(1e-3, 1e-3)
+    )
+    with pytest.raises(RuntimeError, match="`y0` has numbers that are NaN or infinite"):
+        solve(first, starts[1], **options)
+    sol = jax.vmap(lambda y0: solve(first, y0, throw=False, **options))(starts)
+    assert (sol.result == dfx.RESULTS.successful).tolist() == [True, False]
+    assert (sol.result == dfx.RESULTS.nonlinear_divergence).tolist() == [False, True]
+
+
 def test_inconsistent_start_is_moved_and_reported():
     sol = solve(y0=jnp.array([1.1, 0.0]), saveat=dfx.SaveAt(t0=True, t1=True))
     np.testing.assert_allclose(np.sum(np.square(sol.ys), axis=1), 1, atol=1e-15)

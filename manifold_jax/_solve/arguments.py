@@ -53,6 +53,11 @@ def check_arguments(
     for sub in jtu.tree_leaves(saveat.subs, is_leaf=lambda x: isinstance(x, dfx.SubSaveAt)):
         if sub.fn is not save_y:
             check_function("saveat.fn", sub.fn, "fn(t, y, args)")
+    if dt0 is None and isinstance(stepsize_controller, dfx.ConstantStepSize):
+        raise ValueError(
+            "`dt0` is None, but the size of the steps is constant: give it, or let "
+            "`stepsize_controller=diffrax.PIDController(rtol=1e-6, atol=1e-6)` choose."
+        )
     if isinstance(dt0, int | float) and not abs(dt0) > 0:
         raise ValueError(
             f"`dt0` must be the length of the first step, with the sign of t1 - t0, got {dt0}. With an adaptive "

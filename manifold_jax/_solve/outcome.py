@@ -36,6 +36,11 @@ _SINGULAR = (
     "`mj.MassMatrixTerm.consistent_state`), or the matrix M - h gamma df/dy is singular or not finite, as where the index "
     "of M y' = f is above 1 (reduce it, for example with `mj.reduce_dae`)."
 )
+_TOO_MANY = (
+    "The maximum number of solver steps was reached. A long solve needs a larger `max_steps`, a stiff one `mj.Rodas5P()`; "
+    "steps become tiny near a singular configuration (`throw=False` says in `sol.ts` when), and with a tolerance "
+    'below the round-off of 32-bit numbers (`jax.config.update("jax_enable_x64", True)`).'
+)
 _NOT_TANGENT = (
     "The maximum number of solver steps was reached, and the corrections undid a large part of every step: the vector "
     "field in `terms` is not tangent to the manifold. Make it so with `mj.tangent_field(f, constraint)`, or see "
@@ -67,10 +72,11 @@ def fault_messages(
 ) -> list[tuple[BoolScalar, str]]:
     """What to say instead of Diffrax's messages, and where it applies."""
     not_corrected = _NOT_CORRECTED if solver.corrects_output else _TOO_LONG
-    faults = [(result == nonlinear_failure(), not_corrected)]
+    too_many = result == RESULTS.max_steps_reached
+    faults = [(result == nonlinear_failure(), not_corrected), (too_many, _TOO_MANY)]
     if isinstance(solver, Projected):
         undone = _undo_steps(statistics, num_accepted_steps, solver.projection)
-        faults.append((undone & (result == RESULTS.max_steps_reached), _NOT_TANGENT))
+        faults.append((undone & too_many, _NOT_TANGENT))
     return faults
 
 
