@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from ._constraint import AbstractConstraint
 from ._custom_types import Args, BoolScalar, IntScalar, RealScalarLike, Y
 from ._projection_info import ProjectionInfo
+from ._rejection import is_finite
 
 
 NOT_THERE = 3  # the message for a state that may not be moved
@@ -45,7 +46,7 @@ class Diagnosis(NamedTuple):
         for applies, message in constraint.faults(t, y, args):
             cause = jnp.where(applies, len(messages), cause)
             messages = (*messages, message)
-        return Diagnosis(cause, messages)
+        return Diagnosis(jnp.where(is_finite(y), cause, NOT_FINITE), messages)
 
     def raise_unless(self, success: BoolScalar, value: Any, name: str) -> Any:
         """Attach the error that names the cause to `value`; `name` is that of the state.

@@ -14,6 +14,7 @@ from ._diagnosis import Diagnosis
 from ._errors import clear_errors
 from ._projection import NewtonProjection
 from ._projection_info import ProjectionInfo
+from ._rejection import is_finite
 
 
 State = TypeVar("State")  # of the same structure goes in and comes out
@@ -91,7 +92,7 @@ def consistent_state(
 
     **Raises:**
 
-    A `RuntimeError` (under `jit` too) that says whether the constraint was not finite, its
+    A `RuntimeError` (under `jit` too) that says whether the state or the constraint was not finite, its
     Jacobian rank deficient, or the equations could not be satisfied.
     """
     projection = NewtonProjection() if projection is None else projection
@@ -114,6 +115,8 @@ def moved(
     y = jtu.tree_map(jnp.asarray, y)
     check_constraint(constraint, t, y, args)
     p, info = constraint.correct(projection, t, y, args, far=True)
+    # Also what the constraint does not see.
+    info = dataclasses.replace(info, success=info.success & is_finite(y))
     if throw:
         diagnosis = Diagnosis.of_start(constraint, t, y, args, info)
         p = diagnosis.raise_unless(info.success, p, name)

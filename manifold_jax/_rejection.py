@@ -9,10 +9,13 @@ from diffrax import RESULTS
 from ._custom_types import BoolScalar, FloatScalar, RealScalarLike, Y
 
 
-def result_of_state(y: Y) -> RESULTS:
+def is_finite(y: Y) -> BoolScalar:
     finite = [jnp.all(jnp.isfinite(leaf)) for leaf in jtu.tree_leaves(y)]
-    finite = functools.reduce(jnp.logical_and, finite)
-    return RESULTS.where(finite, RESULTS.successful, RESULTS.nonfinite)  # pyright: ignore[reportArgumentType]
+    return functools.reduce(jnp.logical_and, finite)
+
+
+def result_of_state(y: Y) -> RESULTS:
+    return RESULTS.where(is_finite(y), RESULTS.successful, RESULTS.nonfinite)  # pyright: ignore[reportArgumentType]
 
 
 def is_repeatable(t0: RealScalarLike, t1: RealScalarLike, first_step: FloatScalar) -> BoolScalar:

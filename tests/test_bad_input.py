@@ -98,6 +98,9 @@ def test_a_start_that_is_not_finite(consistent):
     )
     with pytest.raises(RuntimeError, match="`y0` has numbers that are NaN or infinite"):
         solve(first, starts[1], **options)
+    for move in (mj.project, mj.consistent_state):
+        with pytest.raises(RuntimeError, match="has numbers that are NaN or infinite"):
+            move(first, 0.0, starts[1])
     sol = jax.vmap(lambda y0: solve(first, y0, throw=False, **options))(starts)
     assert (sol.result == dfx.RESULTS.successful).tolist() == [True, False]
     assert (sol.result == dfx.RESULTS.nonlinear_divergence).tolist() == [False, True]

@@ -7,9 +7,10 @@ import jax.tree_util as jtu
 
 from .._constraint import AbstractConstraint
 from .._custom_types import Args, BoolScalar, FloatScalar, RealScalarLike, Y
-from .._diagnosis import Diagnosis, NOT_FINITE, NOT_THERE
+from .._diagnosis import Diagnosis, NOT_THERE
 from .._project import consistent_state
 from .._projection import NewtonProjection
+from .._rejection import is_finite
 from .._violation import constraint_violation
 
 
@@ -36,22 +37,17 @@ def start_state(
     if consistent == "assume":
         dtype = jnp.result_type(*jtu.tree_leaves(y0))
         return y0, StartInfo(jnp.zeros((), dtype), jnp.asarray(True))
-    finite = jnp.asarray([jnp.all(jnp.isfinite(leaf)) for leaf in jtu.tree_leaves(y0)]).all()
     start, info = consistent_state(constraint, t0, y0, args, projection=projection, throw=False)
-    success, correction = info.success & finite, info.correction
+    success, correction = info.success, info.correction
     if consistent == "check":
         violation = constraint_violation(constraint, t0, y0, args)
         satisfied = violation <= projection.tolerance_for(violation.dtype)
-        start, success, correction = (
-            y0,
-            satisfied & info.full_rank & finite,
-            jnp.zeros_like(correction),
-        )
+        success = satisfied & info.full_rank & is_finite(y0)
+        start, correction = y0, jnp.zeros_like(correction)
     if throw:
         diagnosis = Diagnosis.of_start(constraint, t0, y0, args, info)
-        cause = diagnosis.cause
         if consistent == "check":
-            cause = jnp.where(info.success, NOT_THERE, cause)
-        diagnosis = diagnosis._replace(cause=jnp.where(finite, cause, NOT_FINITE))
+            cause = jnp.where(info.success, NOT_THERE, diagnosis.cause)
+            diagnosis = diagnosis._replace(cause=cause)
         start = diagnosis.raise_unless(success, start, "y0")
     return start, StartInfo(correction, success)
