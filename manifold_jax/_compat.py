@@ -86,6 +86,11 @@ def save_states(state: LoopState) -> list[SaveState]:
     return [leaf for leaf in leaves if is_save_state(leaf)]
 
 
+def with_result(state: LoopState, result: RESULTS) -> LoopState:
+    """A solve that ends with this result before its next step, unless it is "successful"."""
+    return eqx.tree_at(lambda s: s.result, state, update_result(state.result, result))
+
+
 class Progress(NamedTuple):
     """How far a solve is: where its next step begins and ends, from what, and how many there were."""
 

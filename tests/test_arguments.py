@@ -179,3 +179,11 @@ def test_states_of_another_shape_than_the_constraint_expects():
         mj.constraint_violation(CIRCLE, 0.0, jnp.ones((5, 2)))
     assert "shapes (5, 2)" in error.value.__notes__[0]
     assert "sol.ts, sol.ys" in error.value.__notes__[0]
+
+
+def test_one_state_where_an_ensemble_has_many():
+    with pytest.raises(IndexError) as error:
+        mj.solve_ensemble(TURN, dfx.Bosh3(), 0.0, 1.0, 0.1, START)
+    assert (
+        "Of the 2 trajectories of `y0s` each has a state of shapes ()" in error.value.__notes__[0]
+    )

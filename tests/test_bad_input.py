@@ -104,6 +104,21 @@ def test_a_start_that_is_not_finite(consistent):
     sol = jax.vmap(lambda y0: solve(first, y0, throw=False, **options))(starts)
     assert (sol.result == dfx.RESULTS.successful).tolist() == [True, False]
     assert (sol.result == dfx.RESULTS.nonlinear_divergence).tolist() == [False, True]
+    assert sol.stats["num_steps"][1] == 0
+
+
+@pytest.mark.parametrize("solver", [dfx.Bosh3(), mj.Rodas3P()], ids=["explicit", "Rosenbrock"])
+def test_a_start_that_is_not_finite_without_a_hook(solver):
+    """An adaptive controller rejected `max_steps` steps, its tolerance being NaN."""
+    starts = jnp.array([[1.0, 0.0], [1.0, jnp.nan]])
+    options = dict(t0=0.0, t1=0.1, dt0=None, stepsize_controller=dfx.PIDController(1e-3, 1e-3))
+    single = lambda y0, throw: mj.diffeqsolve(TURN, solver, y0=y0, throw=throw, **options)
+    with pytest.raises(RuntimeError, match="The state is not finite"):
+        single(starts[1], True)
+    batch = jax.vmap(lambda y0: single(y0, False))(starts)
+    for sol in (batch, mj.solve_ensemble(TURN, solver, y0s=starts, **options)):
+        assert (sol.result == dfx.RESULTS.nonfinite).tolist() == [False, True]
+        assert sol.stats["num_steps"].tolist()[1] == 0
 
 
 def test_inconsistent_start_is_moved_and_reported():

@@ -121,8 +121,9 @@ def ring_modulator(t, y, rate, a):
 @pytest.mark.slow
 def test_ring_modulator():
     """Problem `ring modulator` of Mazzia & Magherini, Test Set for Initial Value Problem Solvers
-    (2008): of index 2 for `Cs = 0`. Against SciPy's Radau at 1e-7 with capacitors of 2e-12 and 2e-13, extrapolated to none: the
-    voltages and the current that do not oscillate for longer the smaller the capacitors are."""
+    (2008): of index 2 for `Cs = 0`. Against SciPy's Radau at 1e-7 with capacitors of 2e-12 and
+    2e-13, extrapolated to none: the voltages and the current that do not oscillate for longer the
+    smaller the capacitors are."""
     dae = mj.reduce_dae(ring_modulator, jnp.zeros(15), form="index-1")
     assert (dae.report.index, dae.report.degrees_of_freedom) == (2, 10)
     assert "F[2] - F[3] + F[4] - F[5]" in dae.report.equations

@@ -519,6 +519,9 @@ def test_infeasible_starts(reduced):
         dae.consistent_state(0.0, PENDULUM_GUESS[:4], args)
     with pytest.raises(ValueError, match=r"vector of shape \(4,\)"):
         dae.terms.vf(0.0, PENDULUM_GUESS, args)
+    for guess in (PENDULUM_GUESS, tuple(PENDULUM_GUESS)):  # unknowns for the state
+        with pytest.raises(ValueError, match=r"shape \(4,\).*`dae.consistent_state` makes one"):
+            solve(dae.terms, dae.constraint, guess, args, 1.0)
     batch = jnp.stack([PENDULUM_GUESS, PENDULUM_GUESS.at[0].set(jnp.nan), jnp.zeros(5)])
     _, info = jax.vmap(lambda x: dae.consistent_state(0.0, x, args, throw=False))(batch)
     assert info.success.tolist() == [True, False, False]

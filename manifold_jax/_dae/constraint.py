@@ -7,10 +7,12 @@ import equinox as eqx
 import jax
 import jax.flatten_util as jfu
 import jax.numpy as jnp
+import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Float
 
 from .._constraint import AbstractConstraint
+from .._constraint_checks import check_state
 from .._custom_types import Args, BoolScalar, RealScalarLike, Y
 from .._newton import implicit_root
 from .._residual import as_time
@@ -35,12 +37,26 @@ class Reduced(eqx.Module):
     def closing(self, t: Any, z: Array, args: Args) -> Closing:
         return Closing(self.equations, as_time(t, z.dtype), z, args, self.static)
 
-    def split(self, y: Float[Array, " n"]) -> tuple[Array, Array | None]:
+    def split(self, y: Y) -> tuple[Array, Array | None]:
         """The state `z`, and the leading derivatives where they belong to it."""
+        self.check(y)
         if not self.static.plan.implicit:
             return y, None
         states = self.static.plan.layout.num_states
         return y[:states], y[states:]
+
+    def check(self, y: Any) -> None:
+        """Refuse what is no state, such as the unknowns of the user's equations."""
+        check_state(y, "z")
+        plan = self.static.plan
+        size = plan.layout.num_states + len(plan.layout.structure.d) * plan.implicit
+        if eqx.is_array_like(y) and jnp.shape(y) == (size,):
+            return
+        raise ValueError(
+            f"The state of a reduced system is one vector of shape ({size},), with the names in `dae.report.states`; "
+            f"got {jtu.tree_map(jnp.shape, y)}. `dae.consistent_state` makes one from a guess of x; of many states "
+            "take `jax.vmap`."
+        )
 
 
 class ReducedConstraint(AbstractConstraint):

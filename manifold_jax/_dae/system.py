@@ -4,10 +4,8 @@ from typing import Any
 
 import diffrax as dfx
 import equinox as eqx
-import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._constraint_checks import check_state
 from .._custom_types import Args, RealScalarLike, Y
 from .._projection_info import ProjectionInfo
 from .._rosenbrock import MassMatrixTerm
@@ -87,23 +85,15 @@ class ReducedDAE(eqx.Module):
         Of one state; `jax.vmap(dae.outputs, in_axes=(0, 0, None))` of saved ones. Derivatives that
         are not in the equations are found by differentiating along the solution.
         """
-        self._check(z)
+        self.system.check(z)
         equations = self.system.equations
         found = unknowns_with_derivatives(self.system, t, z, args, equations.order)
         return tuple(equations.unravel(x) for x in found)
 
     def _field(self, t: RealScalarLike, y: Float[Array, " states"], args: Args) -> Array:
-        self._check(y)
+        self.system.check(y)
         return rate(self.system, t, y, args)
 
     def _implicit_field(self, t: RealScalarLike, y: Float[Array, " states"], args: Args) -> Array:
-        self._check(y)
+        self.system.check(y)
         return implicit_field(self.system, t, y, args)
-
-    def _check(self, z: Any) -> None:
-        check_state(z, "z")
-        if jnp.shape(z) != (len(self.report.states),):
-            raise ValueError(
-                f"The state of a reduced system is a vector of shape ({len(self.report.states)},), with the names in "
-                f"`dae.report.states`; got {jnp.shape(z)}. `dae.consistent_state` makes one from a guess of x."
-            )

@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import diffrax as dfx
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -9,7 +10,8 @@ import numpy as np
 from diffrax import RESULTS
 from jaxtyping import Array, PyTree
 
-from .._compat import is_okay, messages_of_results, number_of_result
+from .._compat import is_okay, number_of_result
+from .._solve.outcome import is_unusable_start, messages_for, UNUSABLE_START
 
 
 class EnsembleSolution(eqx.Module):
@@ -21,6 +23,8 @@ class EnsembleSolution(eqx.Module):
     - `stats`: as of [`diffeqsolve`][] without `max_steps`, each of shape `(N,)`.
     - `result`: the result codes of all trajectories.
     - `execution`: "in lanes", or why not.
+    - `messages`: what the result codes mean, by number; the last one says of a trajectory without steps
+        that its start could not be used.
     """
 
     ts: PyTree[Array]
@@ -28,21 +32,30 @@ class EnsembleSolution(eqx.Module):
     stats: dict[str, Any]
     result: RESULTS
     execution: str = eqx.field(static=True, default="in lanes")
+    messages: tuple[str, ...] = eqx.field(static=True, default=(), repr=False)
 
     @property
     def failed(self) -> Array:
         """Which trajectories did not get to their end, shape `(N,)`."""
         return ~jax.vmap(is_okay)(self.result)
 
+    def reasons(self) -> Array:
+        """Numbers of `messages`, shape `(N,)`, 0 where a trajectory is successful."""
+        codes = number_of_result(self.result)
+        unusable = is_unusable_start(codes, self.stats["num_steps"])
+        return jnp.where(self.failed, jnp.where(unusable, len(self.messages) - 1, codes), 0)
+
     def failures(self, most: int = 10) -> list[tuple[int, str]]:
         """Numbers and reasons of the first that failed; not under `jit`. Of several processes each
         lists those of its own devices."""
-        codes, messages = jnp.asarray(number_of_result(self.result)), messages_of_results()
-        successful, failed = number_of_result(RESULTS.successful), {}
-        for shard in codes.addressable_shards:
+        reasons, failed = jnp.asarray(self.reasons()), {}
+        for shard in reasons.addressable_shards:
             part = np.asarray(shard.data)
             first = shard.index[0].start or 0
-            failed |= {
-                first + int(i): messages[part[i]] for i in np.flatnonzero(part != successful)
-            }
+            failed |= {first + int(i): self.messages[part[i]] for i in np.flatnonzero(part)}
         return sorted(failed.items())[:most]
+
+
+def messages_of(solver: dfx.AbstractSolver) -> tuple[str, ...]:
+    """What `EnsembleSolution.reasons` are numbers of."""
+    return (*messages_for(solver), UNUSABLE_START)

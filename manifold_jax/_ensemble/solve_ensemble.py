@@ -5,22 +5,23 @@ from typing import Any
 
 import diffrax as dfx
 import equinox as eqx
+import jax
 import jax.numpy as jnp
+import jax.tree_util as jtu
 from jax.sharding import Mesh
 from jaxtyping import Array
 
 from .._adjoint import StepReplayAdjoint
-from .._compat import messages_of_results, number_of_result
 from .._custom_types import Args, RealScalarLike, Y
 from .._errors import clear_errors
 from .._solve.arguments import check_arguments
 from .._solve.start import Consistent
-from .arguments import checked_batch, checked_step, checked_times
+from .arguments import Batch, checked_batch, checked_step, checked_times
 from .axes import anywhere, Axes, largest
 from .devices import check_mesh, over_devices
 from .execution import solve_on_one_device
 from .parts import Inputs
-from .solution import EnsembleSolution
+from .solution import EnsembleSolution, messages_of
 from .trajectory import Equations
 
 
@@ -105,14 +106,27 @@ def solve_ensemble(
         saveat = checked_times(equations.saveat, batch, axes)
         dt0 = checked_step(equations.dt0, batch, axes)
         inputs = dataclasses.replace(equations, saveat=saveat, dt0=dt0), batch
-        solution = solve_on_one_device(inputs, lanes)
+        try:
+            solution = solve_on_one_device(inputs, lanes)
+        except Exception as error:
+            error.add_note(_example(inputs[1]))
+            raise
+        solution = dataclasses.replace(solution, messages=messages_of(solver))
         return _raise_if_any_failed(solution, axes) if throw else solution
 
     inputs = equations, batch
     return solve(inputs) if mesh is None else over_devices(solve, inputs, mesh)
 
 
+def _example(batch: Batch) -> str:
+    """For errors in what the user wrote."""
+    one = jax.eval_shape(batch.one)
+    return (
+        f"Of the {batch.size} trajectories of `y0s` each has a state of shapes {jtu.tree_map(jnp.shape, one.y0)}: the "
+        "leading axes are the trajectories. One alone is solved by `mj.diffeqsolve`."
+    )
+
+
 def _raise_if_any_failed(solution: EnsembleSolution, axes: Axes) -> EnsembleSolution:
-    number = largest(jnp.where(solution.failed, number_of_result(solution.result), 0), axes)
-    failed = anywhere(solution.failed, axes)
-    return eqx.branched_error_if(solution, failed, number, messages_of_results())
+    number, failed = largest(solution.reasons(), axes), anywhere(solution.failed, axes)
+    return eqx.branched_error_if(solution, failed, number, solution.messages)

@@ -2,14 +2,12 @@
 
 import contextlib
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import jax.tree_util as jtu
 import numpy as np
-
-from .._compat import messages_of_results
 
 
 # Marks in `result` the trajectories that are not there yet.
@@ -39,8 +37,8 @@ class StoredEnsemble:
 
     - `group`: the folder as a `zarr.Group`, of the arrays below.
     - `ts`, `ys`, `stats`: as of [`EnsembleSolution`][], `zarr.Array`s or groups of them.
-    - `result`: numbers of the result codes, -1 for what has not been computed yet; `messages` says
-        what they mean.
+    - `result`: numbers of what happened, 0 where all is well, -1 for what has not been computed yet;
+        `messages` says what they mean.
     - `settings`: what it was computed with.
     - `size`, `chunk`, `finished`: how many trajectories it has at its end, in one piece, and by now.
     - `num_failed`: how many of those that are finished failed.
@@ -152,9 +150,9 @@ def stored_at(path: Path, mode: str = "r") -> StoredEnsemble | None:
     return StoredEnsemble(group) if "settings" in group.attrs else None
 
 
-def created(path: Path, settings: dict[str, Any]) -> StoredEnsemble:
+def created(path: Path, settings: dict[str, Any], messages: Sequence[str]) -> StoredEnsemble:
     """Its settings come first, so that whatever a folder has belongs to some."""
-    attributes = {"settings": settings, "messages": messages_of_results()}
+    attributes = {"settings": settings, "messages": list(messages)}
     with clear_write_errors(path):
         return StoredEnsemble(zarr().create_group(path, attributes=attributes))
 

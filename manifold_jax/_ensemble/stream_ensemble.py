@@ -2,7 +2,7 @@
 
 import errno
 import operator
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,13 +13,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from .._compat import number_of_result
 from .._custom_types import RealScalarLike
 from .._errors import clear_errors
 from .._solve.start import Consistent
 from .progress import Meter
 from .sampling import drawn
 from .settings import check_settings, settings_of
+from .solution import messages_of
 from .solve_ensemble import solve_ensemble
 from .store import (
     clear_partial,
@@ -128,7 +128,7 @@ def stream_ensemble(
     named(examples)  # refuses names before anything is written
     lowered = _solve_chunk.lower(*call(0))
     settings = {"size": size, "chunk": chunk, "seed": int(seed), **parts, **options}
-    stored = _opened(out, settings_of(settings, lowered.as_text()), resume)
+    stored = _opened(out, settings_of(settings, lowered.as_text()), messages_of(solver), resume)
     ensure_arrays(stored, examples)
     finished, failed = stored.finished, stored.num_failed
     with Meter(size, finished, failed, progress) as meter:
@@ -166,17 +166,19 @@ def _solve_chunk(
         "ts": solution.ts,
         "ys": solution.ys,
         "stats": solution.stats,
-        "result": number_of_result(solution.result).astype(jnp.int8),
+        "result": solution.reasons().astype(jnp.int8),
     }
 
 
-def _opened(out: Path, settings: dict[str, Any], resume: bool) -> StoredEnsemble:
+def _opened(
+    out: Path, settings: dict[str, Any], messages: Sequence[str], resume: bool
+) -> StoredEnsemble:
     """The folder, new or as it is, with those settings."""
     with clear_write_errors(out):
         out.mkdir(parents=True, exist_ok=True)
         is_empty = all(resume and is_partial(file) for file in out.iterdir())
     if is_empty:
-        stored = created(out, settings)
+        stored = created(out, settings, messages)
     elif not resume:
         raise FileExistsError(
             errno.EEXIST,

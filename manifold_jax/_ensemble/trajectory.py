@@ -14,6 +14,7 @@ from diffrax import RESULTS
 
 from .._compat import directed, is_okay, nonlinear_failure, update_result
 from .._custom_types import Args, BoolScalar, FloatScalar, IntScalar, RealScalarLike, Y
+from .._rejection import result_of_state
 from .._solve.prepare import prepare, Ready
 from .._solve.start import Consistent
 from .._solver.advance import HookState, StepStatistics
@@ -98,6 +99,7 @@ class Equations(eqx.Module):
         if solver_state is None:
             solver_state = solver.init(terms, t0, tnext, ready.y0, args)
         result = RESULTS.where(ready.start.success, RESULTS.successful, nonlinear_failure())
+        result = update_result(result, result_of_state(ready.y0))
         zero = jnp.zeros((), jnp.int32)
         trajectory = Trajectory(
             t0, tnext, ready.y0, solver_state, controller_state, result, zero, zero

@@ -7,7 +7,7 @@ from .._compat import is_okay, nonlinear_failure, update_result
 from .._custom_types import Args, Y
 from .._interpolation import ManifoldInterpolation
 from .._solver.base import AbstractManifoldSolver
-from .outcome import fault_messages, raise_if_failed, result_of_saved
+from .outcome import raise_if_failed, result_of_saved, tangency_fault
 from .output import project_output
 from .start import StartInfo
 
@@ -29,9 +29,9 @@ def finish(
     sol = _corrected(sol, solver, given, saveat, event, y0, args, start)
     if not throw:
         return sol
-    faults = fault_messages(sol.result, solver, statistics, sol.stats["num_accepted_steps"])
+    faults = tangency_fault(sol.result, solver, statistics, sol.stats["num_accepted_steps"])
     # A bad start has raised its own, clearer error.
-    return raise_if_failed(sol, ~is_okay(sol.result) & start.success, faults)
+    return raise_if_failed(sol, ~is_okay(sol.result) & start.success, solver, faults)
 
 
 def _corrected(

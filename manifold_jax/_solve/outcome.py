@@ -1,5 +1,6 @@
 """How a solve ended: what is no success although Diffrax calls it one, and the message of a failure."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import diffrax as dfx
@@ -41,6 +42,11 @@ _TOO_MANY = (
     "steps become tiny near a singular configuration (`throw=False` says in `sol.ts` when), and with a tolerance "
     'below the round-off of 32-bit numbers (`jax.config.update("jax_enable_x64", True)`).'
 )
+UNUSABLE_START = (
+    "`y0` could not be made consistent with `constraint`: it has numbers that are not finite, no nearby state satisfies "
+    "the equations, or their Jacobian does not have full rank there. `mj.consistent_state(constraint, t0, y0, args)` of "
+    "this one says which."
+)
 _NOT_TANGENT = (
     "The maximum number of solver steps was reached, and the corrections undid a large part of every step: the vector "
     "field in `terms` is not tangent to the manifold. Make it so with `mj.tangent_field(f, constraint)`, or see "
@@ -64,27 +70,36 @@ def result_of_saved(saveat: dfx.SaveAt, ts: Any, ys: Any) -> RESULTS:
     return RESULTS.where(finite, RESULTS.successful, RESULTS.nonfinite)  # pyright: ignore[reportArgumentType]
 
 
-def fault_messages(
+def messages_for(solver: dfx.AbstractSolver) -> list[str]:
+    """What the result codes of a solve mean, by number, instead of what Diffrax says."""
+    messages = messages_of_results()
+    texts = [(RESULTS.max_steps_reached, _TOO_MANY), (RESULTS.nonfinite, _NOT_FINITE)]
+    if isinstance(solver, AbstractManifoldSolver):
+        text = _NOT_CORRECTED if solver.corrects_output else _TOO_LONG
+        texts.append((nonlinear_failure(), text))
+    elif isinstance(solver, AbstractRosenbrock):
+        texts.append((nonlinear_failure(), _SINGULAR))
+    for result, text in texts:
+        messages[int(number_of_result(result))] = text
+    return messages
+
+
+def is_unusable_start(number: Any, num_steps: Any) -> Any:
+    """Whether a trajectory failed before its first step, from the number of its result code."""
+    return (number == number_of_result(nonlinear_failure())) & (num_steps == 0)
+
+
+def tangency_fault(
     result: RESULTS,
     solver: AbstractManifoldSolver,
     statistics: StepStatistics,
     num_accepted_steps: IntScalar,
 ) -> list[tuple[BoolScalar, str]]:
-    """What to say instead of Diffrax's messages, and where it applies."""
-    not_corrected = _NOT_CORRECTED if solver.corrects_output else _TOO_LONG
-    too_many = result == RESULTS.max_steps_reached
-    faults = [(result == nonlinear_failure(), not_corrected), (too_many, _TOO_MANY)]
-    if isinstance(solver, Projected):
-        undone = _undo_steps(statistics, num_accepted_steps, solver.projection)
-        faults.append((undone & too_many, _NOT_TANGENT))
-    return faults
-
-
-def alone_messages(result: RESULTS, solver: dfx.AbstractSolver) -> list[tuple[BoolScalar, str]]:
-    """The same for a solver without a hook."""
-    if not isinstance(solver, AbstractRosenbrock):
+    """What to say of too many steps, and where it applies."""
+    if not isinstance(solver, Projected):
         return []
-    return [(result == nonlinear_failure(), _SINGULAR)]
+    undone = _undo_steps(statistics, num_accepted_steps, solver.projection)
+    return [(undone & (result == RESULTS.max_steps_reached), _NOT_TANGENT)]
 
 
 def _undo_steps(
@@ -106,11 +121,13 @@ def _undo_steps(
 
 
 def raise_if_failed(
-    sol: dfx.Solution, failed: BoolScalar, faults: list[tuple[BoolScalar, str]]
+    sol: dfx.Solution,
+    failed: BoolScalar,
+    solver: dfx.AbstractSolver,
+    faults: Sequence[tuple[BoolScalar, str]] = (),
 ) -> dfx.Solution:
     """Attach the message of the last of the `faults` that applies, or that of the result."""
-    faults = [*faults, (sol.result == RESULTS.nonfinite, _NOT_FINITE)]
-    messages, number = messages_of_results(), number_of_result(sol.result)
+    messages, number = messages_for(solver), number_of_result(sol.result)
     for fault, message in faults:
         number = jnp.where(fault, len(messages), number)
         messages.append(message)

@@ -57,6 +57,8 @@ def prepare(
     if dt0 is None and (first := chosen_first_step(terms, solver, t0, t1, y0, args, controller)):
         dt0 = first.size
         solver_state = _solver_state(terms, solver, t0, y0, args, first)
+    if not throw:  # what starts with NaN ends before its first step
+        y0 = jtu.tree_map(lambda leaf: jnp.where(start.success, leaf, jnp.nan), y0)
     return Ready(t0, t1, dt0, y0, solver_state, start)
 
 

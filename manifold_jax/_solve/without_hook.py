@@ -12,7 +12,7 @@ from .._custom_types import Args, RealScalarLike, Y
 from .._rosenbrock import AbstractRosenbrock
 from .._solver.implicit import with_accurate_stages
 from .mass_matrix import consistent_with_mass, trusting
-from .outcome import alone_messages, raise_if_failed, result_of_saved
+from .outcome import raise_if_failed, result_of_saved
 from .prepare import as_state, chosen_first_step, time_dtype
 from .start import Consistent
 
@@ -50,7 +50,7 @@ def solve_without_hook(
         both = saveat.subs, dfx.SubSaveAt(t1=True)
         watched = eqx.tree_at(lambda s: s.subs, saveat, both, is_leaf=lambda x: x is None)
     sol = dfx.diffeqsolve(
-        terms, solver, t0, t1, dt0, y0, args, saveat=watched, throw=throw, **options
+        terms, solver, t0, t1, dt0, y0, args, saveat=watched, throw=False, **options
     )
     result = update_result(sol.result, result_of_saved(watched, sol.ts, sol.ys))
     ts, ys = (sol.ts[0], sol.ys[0]) if unseen else (sol.ts, sol.ys)  # pyright: ignore[reportOptionalSubscript]
@@ -59,4 +59,4 @@ def solve_without_hook(
     )
     if moved is not None:
         sol = eqx.tree_at(lambda s: s.stats, sol, {**sol.stats, "initial_correction": moved})
-    return raise_if_failed(sol, ~is_okay(result), alone_messages(result, solver)) if throw else sol
+    return raise_if_failed(sol, ~is_okay(result), solver) if throw else sol
