@@ -8,6 +8,7 @@ from ._multibody import (
     Cylindrical as Cylindrical,
     Damper as Damper,
     Distance as Distance,
+    Drive as Drive,
     Fixed as Fixed,
     Force as Force,
     from_mujoco as from_mujoco,

@@ -290,7 +290,7 @@ def test_more_joints_are_no_more_operations():
         joints = [mb.Spherical(*p, at=(i - 0.5, 0, 0)) for i, p in enumerate(pairs)]
         robot = mb.Assembly(bodies, joints, gravity=GRAVITY)
         y = robot.state()
-        field = lambda y: (robot.system.force(0.0, *y, None), robot._equations(y[0]))
+        field = lambda y: (robot.system.force(0.0, *y, None), robot._equations(0.0, y[0], None))
         return len(jax.make_jaxpr(field)(y).eqns)
 
     assert operations(3) == operations(40)

@@ -16,6 +16,7 @@ from .joints import (
     AbstractJoint as AbstractJoint,
     Cylindrical as Cylindrical,
     Distance as Distance,
+    Drive as Drive,
     Fixed as Fixed,
     Prismatic as Prismatic,
     Revolute as Revolute,

@@ -8,15 +8,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._custom_types import Args, FloatScalar, RealScalarLike
+from .._custom_types import Args, RealScalarLike
 from .._mechanics import MechanicalSystem
 from . import reading
 from .bodies import Bodies, Body, Pose
-from .checks import check_vector
+from .checks import check_vector, floating
+from .drives import group_restraints
 from .forces import AbstractForce
 from .frames import Frames, in_space
-from .joint_groups import group_joints, jacobian, JointGroup, residuals
-from .joints import AbstractJoint
+from .joint_groups import jacobian, JointGroup, residuals
+from .joints import AbstractRestraint
 from .load_groups import group_forces
 from .loads import AbstractLoads, add
 from .rotations import rates_matrix, turn_back
@@ -39,7 +40,8 @@ class Assembly(eqx.Module):
     **Arguments:**
 
     - `bodies`: [`Body`][], in any order. `joints`: [`Revolute`][], [`Spherical`][],
-        [`Prismatic`][], [`Cylindrical`][], [`Universal`][], [`Fixed`][], [`Distance`][].
+        [`Prismatic`][], [`Cylindrical`][], [`Universal`][], [`Fixed`][], [`Distance`][], and [`Drive`][]
+        where their motion is prescribed.
     - `forces`: [`Spring`][], [`Damper`][], [`JointSpring`][], [`Motor`][],
         [`LinearActuator`][], [`Force`][], [`Torque`][].
     - `gravity` (m/s^2): shape `(2,)` or `(3,)`; `None` for none.
@@ -66,7 +68,7 @@ class Assembly(eqx.Module):
     def __init__(
         self,
         bodies: Sequence[Body],
-        joints: Sequence[AbstractJoint] = (),
+        joints: Sequence[AbstractRestraint] = (),
         forces: Sequence[AbstractForce] = (),
         *,
         gravity: Any = None,
@@ -74,7 +76,7 @@ class Assembly(eqx.Module):
     ):
         self.bodies = Bodies.of(bodies)
         d = 2 if self.bodies.planar else 3
-        self.joints = group_joints(self.bodies, joints)
+        self.joints = group_restraints(self.bodies, joints)
         self.loads = group_forces(self.bodies, self.joints, forces)
         gravity = np.zeros(d) if gravity is None else gravity
         self.gravity = in_space(check_vector("`gravity`", gravity, d))
@@ -109,6 +111,8 @@ class Assembly(eqx.Module):
         angular_velocities: dict[str, Any] | None = None,
         *,
         assemble: bool = False,
+        t: RealScalarLike = 0.0,
+        args: Args = None,
     ) -> tuple[Pose, Pose]:
         """A state `(q, v)`: the drawing at rest, with what is given for some bodies by name.
 
@@ -120,18 +124,21 @@ class Assembly(eqx.Module):
         - `assemble`: keep what is given, and find the rest such that all joints are satisfied, the
             nearest to the drawing and the slowest. For concrete numbers only; traced states are
             moved onto the manifold by [`consistent_state`][].
+        - `t`, `args`: the time of the start and the `args` of the solve, for what [`Drive`][]s prescribe.
 
         **Raises** `ValueError` where joints are not satisfied (without `assemble`) or cannot be:
         which ones, and how large the gap is; and where equations depend on each other but
         `redundant` is false.
         """
         given = positions, orientations, velocities, angular_velocities
-        return make_state(self, given, assemble)
+        return make_state(self, given, assemble, floating(t), args)
 
-    def gaps(self, q: Pose) -> dict[str, Float[Array, " r"]]:
+    def gaps(
+        self, q: Pose, t: RealScalarLike = 0.0, args: Args = None
+    ) -> dict[str, Float[Array, " r"]]:
         """Residuals of the joints by name at the first part of a state `(q, v)`: lengths in metres,
-        cosines of angles."""
-        gaps = residuals(self.joints, q)
+        cosines of angles. `t` and `args` are those of [`Drive`][]s, whose angles are in rad."""
+        gaps = residuals(self.joints_at(t, args), q)
         pairs = [
             (name, row)
             for group, rows in zip(self.joints, gaps, strict=True)
@@ -148,15 +155,16 @@ class Assembly(eqx.Module):
         """Position and velocity in space of the point `at` in the frame of a body."""
         return reading.point(self, y, name, at)
 
-    def joint_coordinates(self, y: tuple[Pose, Pose]) -> dict[str, FloatScalar]:
+    def joint_coordinates(self, y: tuple[Pose, Pose]) -> dict[str, Float[Array, "*t"]]:
         """Angles of hinges (from `-pi` to `pi`) and displacements of sliders by name, zero in the
         drawing."""
         return reading.joint_coordinates(self, y)
 
     def joint_forces(
-        self, t: RealScalarLike, y: tuple[Pose, Pose], args: Args = None
+        self, t: reading.Times, y: tuple[Pose, Pose], args: Args = None
     ) -> dict[str, reading.JointForce]:
-        """Force and torque of every joint on its second body, from the multipliers. With `redundant`
+        """Force and torque of every joint on its second body, from the multipliers, at the time `t` or
+        the times of all states. With `redundant`
         joints it is the sum over those that depend on each other that is determined."""
         return reading.joint_forces(self, t, y, args)
 
@@ -164,14 +172,18 @@ class Assembly(eqx.Module):
         """Kinetic energy, and potential energy of weight and springs."""
         return reading.energy(self, y)
 
-    def _equations(self, q: Pose) -> tuple[Array, ...]:
-        equations = residuals(self.joints, q)
+    def joints_at(self, t: RealScalarLike, args: Args) -> tuple[JointGroup, ...]:
+        """With the motions of drives at that time."""
+        return tuple(group.at(t, args) for group in self.joints)
+
+    def _equations(self, t: RealScalarLike, q: Pose, args: Args) -> tuple[Array, ...]:
+        equations = residuals(self.joints_at(t, args), q)
         if self.bodies.planar:
             return equations
         return (*equations, (jnp.sum(q.orientation**2, axis=1) - 1) / 2)
 
-    def _jacobian(self, q: Pose) -> Float[Array, "m n"]:
-        rows = jacobian(self.joints, q)
+    def _jacobian(self, t: RealScalarLike, q: Pose, args: Args) -> Float[Array, "m n"]:
+        rows = jacobian(self.joints_at(t, args), q)
         if not self.bodies.planar:
             p, own = q.orientation, jnp.eye(len(self.names), dtype=rows.dtype)
             norms = own[:, :, None] * jnp.pad(p, ((0, 0), (3, 0)))[:, None, :]

@@ -64,6 +64,17 @@ def _planar_fixed(s: Sides, length: Any) -> Float[Array, "k 3"]:
     return jnp.concatenate([s.gap[:, :2], _columns(s.cosine(0, 1))], axis=1)
 
 
+def _driven_angle(s: Sides, target: Float[Array, " k"]) -> Float[Array, "k 1"]:
+    """By how much the second body is ahead, from `-pi` to `pi`."""
+    sine, cosine = s.cosine(1, 0), s.cosine(0, 0)
+    ahead = sine * jnp.cos(target) - cosine * jnp.sin(target)
+    return _columns(jnp.arctan2(ahead, cosine * jnp.cos(target) + sine * jnp.sin(target)))
+
+
+def _driven_distance(s: Sides, target: Float[Array, " k"]) -> Float[Array, "k 1"]:
+    return _columns(s.along(2) - target)
+
+
 SPATIAL: dict[type, Callable] = {
     joints.Spherical: _spherical,
     joints.Revolute: _revolute,
@@ -78,4 +89,8 @@ PLANAR: dict[type, Callable] = {
     joints.Prismatic: _planar_prismatic,
     joints.Fixed: _planar_fixed,
     joints.Distance: _distance,
+}
+DRIVEN: dict[type, Callable] = {
+    joints.Revolute: _driven_angle,
+    joints.Prismatic: _driven_distance,
 }

@@ -1,6 +1,7 @@
 """The joints of an assembly, those of one kind together: residuals, Jacobian, and what they transmit."""
 
-from collections.abc import Callable
+import dataclasses
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -9,22 +10,25 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from .._custom_types import Args, RealScalarLike
 from . import joints
-from .attachment import attach, Attachment, name_all
+from .attachment import attach, Attachment
 from .bodies import Bodies, Pose
 from .checks import check_number, is_concrete, stack
-from .equations import PLANAR, SPATIAL
+from .equations import DRIVEN, PLANAR, SPATIAL
 from .frames import Frames, Placed, with_ground
 from .rotations import length_of
+from .values import evaluate
 
 
 class JointGroup(eqx.Module):
-    """All joints of one kind."""
+    """All joints of one kind, or all drives of hinges or of sliders: these have `motions`."""
 
     kind: type = eqx.field(static=True)
     planar: bool = eqx.field(static=True)
     attachment: Attachment
-    length: Float[Array, " k"]
+    length: Float[Array, " k"]  # of rods; of drives where their joints have to be
+    motions: tuple | None = None
 
     @staticmethod
     def of(kind: type, bodies: Bodies, things: list[Any], names: list[str]) -> "JointGroup":
@@ -43,20 +47,60 @@ class JointGroup(eqx.Module):
         """`placed` are the bodies of the joints, `(2, k, ...)`."""
         return self.equations(self.attachment.sides_of(placed), self.length)
 
+    def at(self, t: RealScalarLike, args: Args) -> "JointGroup":
+        """With its motions at the time."""
+        if self.motions is None:
+            return self
+        names = self.attachment.names
+        return dataclasses.replace(
+            self, length=evaluate("motion", self.motions, t, args, (), names)
+        )
+
     @property
     def equations(self) -> Callable:
+        if self.motions is not None:
+            return DRIVEN[self.kind]
         return (PLANAR if self.planar else SPATIAL)[self.kind]
 
 
-def group_joints(bodies: Bodies, given: Any) -> tuple[JointGroup, ...]:
+def group_joints(
+    bodies: Bodies, named: Iterable[tuple[joints.AbstractJoint, str]]
+) -> tuple[JointGroup, ...]:
     """The joints by their kinds, in the order in which these come first."""
     kinds: dict[type, tuple[list, list]] = {}
-    named = name_all(given, joints.AbstractJoint, "joint")
-    for joint, name in zip(*named, strict=True):
+    for joint, name in named:
         of_kind = kinds.setdefault(type(joint), ([], []))
         of_kind[0].append(joint)
         of_kind[1].append(name)
     return tuple(JointGroup.of(kind, bodies, *of_kind) for kind, of_kind in kinds.items())
+
+
+Found = tuple[JointGroup, int]  # a joint: its group and its place in that
+
+
+def find_joint(groups: tuple[JointGroup, ...], joint: str, name: str) -> Found:
+    """For the force or drive called `name`."""
+    groups = tuple(group for group in groups if group.motions is None)
+    for group in groups:
+        if joint in group.attachment.names:
+            return group, group.attachment.names.index(joint)
+    known = [name for group in groups for name in group.attachment.names][:12]
+    raise ValueError(f"{name} names the joint {joint!r}, which is not there. Joints are {known}.")
+
+
+def attachment_of(found: list[Found], names: Sequence[str]) -> Attachment:
+    """To the bodies of joints, as these are."""
+
+    def of_joints(part: str) -> Array:
+        rows = [(getattr(group.attachment, part), i) for group, i in found]
+        if all(is_concrete(row) for row, _ in rows):
+            return jnp.asarray(np.stack([np.asarray(row)[:, i] for row, i in rows], axis=1))
+        return jnp.stack([row[:, i] for row, i in rows], axis=1)
+
+    first, second = (
+        tuple(group.attachment.bodies[side][i] for group, i in found) for side in (0, 1)
+    )
+    return Attachment(tuple(names), (first, second), of_joints("points"), of_joints("axes"))
 
 
 def _lengths(bodies: Bodies, attachment: Attachment, things: list[Any]) -> Float[Array, " k"]:

@@ -11,7 +11,11 @@ import numpy as np
 from .checks import as_pair, check_axis, check_vector, is_concrete
 
 
-class AbstractJoint(eqx.Module):
+class AbstractRestraint(eqx.Module):
+    """What bodies cannot but follow: a joint, or the drive of one."""
+
+
+class AbstractJoint(AbstractRestraint):
     """What holds two bodies together, or one to `mj.multibody.GROUND`.
 
     The point of the joint is either `at`, a point of space in the drawing, which is then a point of
@@ -125,6 +129,26 @@ class Distance(AbstractJoint):
     @property
     def drawn(self):
         return self.between
+
+
+class Drive(AbstractRestraint):
+    """A drive that moves a hinge or slider as prescribed, with whatever torque or force that takes: one
+    equation, `x - motion(t, args) = 0` (a rheonomic constraint).
+
+    **Arguments:**
+
+    - `joint`: the name of a [`Revolute`][] or [`Prismatic`][], of which there may be one drive.
+    - `motion`: its coordinate `x` (rad or m) as a function `f(t, args)` with two derivatives, or a
+        number; that of [`JointSpring`][], but angles go on beyond `pi`.
+    - `name`: by default made of its joint. [`Assembly.joint_forces`][] has under it the torque or force
+        of the drive.
+
+    Where the torque is known instead of the motion, use [`Motor`][].
+    """
+
+    joint: str = eqx.field(static=True)
+    motion: Any
+    name: str | None = eqx.field(static=True, default=None)
 
 
 WITH_AXIS = {

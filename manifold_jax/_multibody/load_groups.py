@@ -2,21 +2,16 @@
 
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
 
-from .._user_function import check_function
 from . import forces, joints
-from .attachment import attach, Attachment, name_all
+from .attachment import attach, name_all
 from .bodies import Bodies
-from .checks import check_number, check_shape, check_vector, is_concrete, stack
+from .checks import check_number, check_vector, is_concrete, stack
 from .frames import in_space
-from .joint_groups import JointGroup
+from .joint_groups import attachment_of, find_joint, JointGroup
 from .loads import AbstractLoads, BodyLoads, JointLoads, LineLoads, SpringLaws
-
-
-Found = tuple[JointGroup, int]  # a joint: its group and its place in that
+from .values import check_value
 
 
 def group_forces(
@@ -32,7 +27,7 @@ def _kind(force: Any, name: str, groups: tuple[JointGroup, ...]) -> str:
     if isinstance(force, forces.AbstractLineForce):
         return "line"
     if isinstance(force, forces.AbstractJointForce):
-        kind = _find_joint(groups, force.joint, name)[0].kind
+        kind = find_joint(groups, force.joint, name)[0].kind
         if kind not in (joints.Revolute, joints.Prismatic):
             raise ValueError(
                 f"{name}: the joint {force.joint!r} is a {kind.__name__}, which has no single coordinate. Springs and "
@@ -49,32 +44,11 @@ def _loads(
     if kind == "line":
         return LineLoads(attach(bodies, things, names), _laws(things, names, "length"))
     if kind in ("hinge", "slider"):
-        found = [_find_joint(groups, thing.joint, name) for thing, name in given]
-        return JointLoads(kind == "hinge", _attached(found, names), _laws(things, names, "rest"))
+        found = [find_joint(groups, thing.joint, name) for thing, name in given]
+        return JointLoads(
+            kind == "hinge", attachment_of(found, names), _laws(things, names, "rest")
+        )
     return _on_bodies(kind == "torque", bodies, things, names)
-
-
-def _find_joint(groups: tuple[JointGroup, ...], joint: str, name: str) -> Found:
-    for group in groups:
-        if joint in group.attachment.names:
-            return group, group.attachment.names.index(joint)
-    known = [name for group in groups for name in group.attachment.names][:12]
-    raise ValueError(f"{name} names the joint {joint!r}, which is not there. Joints are {known}.")
-
-
-def _attached(found: list[Found], names: list[str]) -> Attachment:
-    """To the bodies of joints, as these are."""
-
-    def of_joints(part: str) -> Array:
-        rows = [(getattr(group.attachment, part), i) for group, i in found]
-        if all(is_concrete(row) for row, _ in rows):
-            return jnp.asarray(np.stack([np.asarray(row)[:, i] for row, i in rows], axis=1))
-        return jnp.stack([row[:, i] for row, i in rows], axis=1)
-
-    first, second = (
-        tuple(group.attachment.bodies[side][i] for group, i in found) for side in (0, 1)
-    )
-    return Attachment(tuple(names), (first, second), of_joints("points"), of_joints("axes"))
 
 
 def _laws(things: list[Any], names: list[str], rest: str) -> SpringLaws:
@@ -87,17 +61,12 @@ def _laws(things: list[Any], names: list[str], rest: str) -> SpringLaws:
         ]
         for law, name in zip(laws, names, strict=True)
     ]
-    values = tuple(_value(law.value, name, ()) for law, name in zip(laws, names, strict=True))
+    values = tuple(
+        check_value("value", law.value, name, ()) for law, name in zip(laws, names, strict=True)
+    )
     driven = any(callable(v) or not is_concrete(v) or np.any(v) for v in values)
     columns = (stack(column) for column in zip(*numbers, strict=True))
     return SpringLaws(tuple(names), *columns, values if driven else None)  # pyright: ignore[reportCallIssue]
-
-
-def _value(value: Any, name: str, shape: tuple[int, ...]) -> Any:
-    if callable(value):
-        check_function(f"value` of `{name}", value, "f(t, args)")
-        return value
-    return check_shape(f"{name}: `value`", value, shape)
 
 
 def _on_bodies(torque: bool, bodies: Bodies, things: list[Any], names: list[str]) -> BodyLoads:
@@ -108,7 +77,7 @@ def _on_bodies(torque: bool, bodies: Bodies, things: list[Any], names: list[str]
         index.append(bodies.moving_index(thing.body, name))
         point = getattr(thing, "point", None)
         points.append(check_vector(f"{name}: `point`", np.zeros(d) if point is None else point, d))
-        values.append(_value(thing.value, name, shape))
+        values.append(check_value("value", thing.value, name, shape))
     return BodyLoads(
         torque, bodies.planar, tuple(names), tuple(index), in_space(stack(points)), tuple(values)
     )

@@ -10,9 +10,9 @@ from jaxtyping import Array, Float
 
 from .._custom_types import Args, FloatScalar, RealScalarLike
 from .attachment import Attachment
-from .checks import check_shape, stack
 from .frames import Frames, in_space
 from .rotations import dot, length_of, turn
+from .values import evaluate
 
 
 Wrench = tuple[Float[Array, "n 3"], Float[Array, "n 3"]]  # forces, torques about the origins
@@ -28,15 +28,6 @@ class AbstractLoads(eqx.Module):
     @abc.abstractmethod
     def potential(self, frames: Frames) -> FloatScalar:
         """The energy stored in springs."""
-
-
-def evaluate(
-    values: tuple, t: RealScalarLike, args: Args, shape: tuple[int, ...], names: tuple[str, ...]
-) -> Array:
-    """Numbers, and functions `f(t, args)`, in one array `(k, *shape)`."""
-    pairs = zip(values, names, strict=True)
-    given = ((value(t, args) if callable(value) else value, name) for value, name in pairs)
-    return stack([check_shape(f"{name}: `value`", value, shape) for value, name in given])
 
 
 class SpringLaws(eqx.Module):
@@ -55,7 +46,7 @@ class SpringLaws(eqx.Module):
         size = self.stiffness * (x - self.rest) + self.damping * rate
         if self.values is None:
             return size
-        return size - evaluate(self.values, t, args, (), self.names)
+        return size - evaluate("value", self.values, t, args, (), self.names)
 
     def energy(self, x: Float[Array, " k"]) -> FloatScalar:
         return jnp.sum(self.stiffness * (x - self.rest) ** 2) / 2
@@ -141,7 +132,7 @@ class BodyLoads(AbstractLoads):
     def wrench(self, t: RealScalarLike, frames: Frames, args: Args) -> Wrench:
         index = np.asarray(self.bodies)
         shape = (() if self.torque else (2,)) if self.planar else (3,)
-        value = evaluate(self.values, t, args, shape, self.names)
+        value = evaluate("value", self.values, t, args, shape, self.names)
         if value.ndim == 1:  # about the normal of the plane
             value = jnp.pad(value[:, None], ((0, 0), (2, 0)))
         value, none = in_space(value), jnp.zeros_like(self.points)

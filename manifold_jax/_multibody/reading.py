@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from .._custom_types import Args, FloatScalar, RealScalarLike
@@ -15,6 +16,9 @@ from .joint_groups import reactions
 from .joints import Prismatic, Revolute
 from .loads import coordinate
 from .rotations import rates_matrix, turn
+
+
+Times = RealScalarLike | Float[Array | np.ndarray, "*t"]  # of one state, or of each
 
 
 class Motion(NamedTuple):
@@ -85,7 +89,7 @@ def point(assembly: Any, y: tuple[Pose, Pose], name: str, at: Any) -> tuple[Arra
 def joint_coordinates(assembly: Any, y: tuple[Pose, Pose]) -> dict[str, FloatScalar]:
     frames, found = Frames.of(*y), {}
     for group in assembly.joints:
-        if group.kind in (Revolute, Prismatic):
+        if group.kind in (Revolute, Prismatic) and group.motions is None:
             values = coordinate(group.attachment.sides(frames), group.kind is Revolute)
             found |= dict(zip(group.attachment.names, values, strict=True))
     return found
@@ -107,7 +111,7 @@ def energy(assembly: Any, y: tuple[Pose, Pose]) -> Energy:
 
 
 def joint_forces(
-    assembly: Any, t: RealScalarLike, y: tuple[Pose, Pose], args: Args
+    assembly: Any, t: Times, y: tuple[Pose, Pose], args: Args
 ) -> dict[str, JointForce]:
     if y[0].position.ndim > 2:
         times = jnp.broadcast_to(floating(t), y[0].position.shape[:1])
@@ -115,7 +119,7 @@ def joint_forces(
     multipliers = assembly.system.multipliers(t, y, args)
     frames, planar = Frames.of(*y), assembly.bodies.planar
     found, start = {}, 0
-    for group in assembly.joints:
+    for group in assembly.joints_at(t, args):
         k, r = group.equations(group.attachment.sides(frames), group.length).shape
         own = multipliers[start : start + k * r].reshape(k, r)
         start += k * r

@@ -14,6 +14,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array
 
+from .._custom_types import Args
 from .bodies import check_orientation, Pose
 from .checks import check_number, check_vector, is_concrete, stack
 from .rotations import rates_matrix, rotation_matrix
@@ -36,16 +37,18 @@ def _dependent(J: np.ndarray) -> float:
     return max(DEPENDENT, 100 * float(np.finfo(J.dtype).eps))
 
 
-def make_state(assembly: Any, given: tuple, assemble: bool) -> tuple[Pose, Pose]:
+def make_state(
+    assembly: Any, given: tuple, assemble: bool, t: Array, args: Args
+) -> tuple[Pose, Pose]:
     y, fixed = _with_given(assembly, given)
-    if not all(is_concrete(leaf) for leaf in jtu.tree_leaves((y, assembly))):
+    if not all(is_concrete(leaf) for leaf in jtu.tree_leaves((y, assembly, t, args))):
         if assemble:
             raise ValueError(
                 "`assemble=True` is for concrete numbers. Of traced ones build the state without it and move it onto the "
                 "manifold by `mj.consistent_state(system.constraint, t, y)`."
             )
         return y
-    find = _Host(assembly, y, fixed)
+    find = _Host(assembly, y, fixed, t, args)
     if assemble:
         y = find.assembled(y)
     find.check(y)
@@ -98,15 +101,19 @@ def _place(
 class _Host:
     """The equations of an assembly and their Jacobians as NumPy arrays."""
 
-    def __init__(self, assembly: Any, y: tuple[Pose, Pose], fixed: tuple[Pose, Pose]):
-        self.assembly, self.fixed = assembly, fixed
+    def __init__(
+        self, assembly: Any, y: tuple[Pose, Pose], fixed: tuple[Pose, Pose], t: Array, args: Args
+    ):
+        self.assembly, self.fixed, self.at = assembly, fixed, (t, args)
         self.unravel = jfu.ravel_pytree(y[0])[1]
-        phi = lambda x: jfu.ravel_pytree(assembly._equations(self.unravel(x)))[0]
-        self.equations: Callable = jax.jit(lambda x: (phi(x), jax.jacfwd(phi)(x)))
+        phi = lambda t, x: jfu.ravel_pytree(assembly._equations(t, self.unravel(x), args))[0]
+        rate = lambda x: jax.jvp(lambda t: phi(t, x), (t,), (jnp.ones_like(t),))
+        self.equations: Callable = jax.jit(lambda x: (*rate(x), jax.jacfwd(phi, 1)(t, x)))
 
-    def __call__(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        phi, J = self.equations(x)
-        return np.asarray(phi), np.asarray(J)
+    def __call__(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Residuals, their rates while nothing moves (that of drives), and their Jacobian."""
+        phi, rate, J = map(np.asarray, self.equations(x))
+        return phi, rate, J
 
     def assembled(self, y: tuple[Pose, Pose]) -> tuple[Pose, Pose]:
         """Gauss-Newton steps of least norm in what is free; velocities by one."""
@@ -116,20 +123,20 @@ class _Host:
             for part in self.fixed
         )
         for _ in range(ITERATIONS):
-            phi, J = self(x)
+            phi, _, J = self(x)
             if np.abs(phi).max(initial=0) < 10 * np.finfo(x.dtype).eps:
                 break
             x[~kept_x] -= np.linalg.lstsq(J[:, ~kept_x], phi, rcond=_dependent(J))[0]
         self.check_positions(x, " Whatever the other bodies do, the joints cannot be closed")
-        _, J = self(x)
-        w[~kept_w] -= np.linalg.lstsq(J[:, ~kept_w], J @ w, rcond=_dependent(J))[0]
+        _, rate, J = self(x)
+        w[~kept_w] -= np.linalg.lstsq(J[:, ~kept_w], rate + J @ w, rcond=_dependent(J))[0]
         return self.unravel(jnp.asarray(x)), self.unravel(jnp.asarray(w))
 
     def check(self, y: tuple[Pose, Pose]) -> None:
         x, w = (np.array(jfu.ravel_pytree(part)[0]) for part in y)
         self.check_positions(x, "")
-        _, J = self(x)
-        rate = np.abs(J @ w)
+        _, driven, J = self(x)
+        rate = np.abs(driven + J @ w)
         most = _closed(x) * max(1, np.abs(w).max())
         if not rate.max(initial=0) <= most:
             worst = self._worst(rate, most, "m/s")
@@ -161,7 +168,8 @@ class _Host:
     def _rows(self) -> list[tuple[str, np.ndarray]]:
         """The rows of every joint among the equations."""
         named, start = [], 0
-        still_there = self.assembly._equations(self.assembly.bodies.drawing)
+        t, args = self.at
+        still_there = self.assembly._equations(t, self.assembly.bodies.drawing, args)
         for group, part in zip(self.assembly.joints, still_there, strict=False):
             rows = start + np.arange(part.size).reshape(part.shape)
             named += list(zip(group.attachment.names, rows, strict=True))

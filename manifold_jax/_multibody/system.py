@@ -29,10 +29,10 @@ class _Joints(AbstractPositions):
     source: Callable
 
     def __call__(self, t: RealScalarLike, q: Pose, args: Args) -> tuple[Array, ...]:
-        return self.source(args)._equations(q)
+        return self.source(args)._equations(t, q, args)
 
     def jacobian(self, t: RealScalarLike, q: Pose, args: Args) -> Float[Array, "m n"]:
-        return self.source(args)._jacobian(q)
+        return self.source(args)._jacobian(t, q, args)
 
 
 class _Forces(eqx.Module):
