@@ -4,6 +4,7 @@ import ast
 import re
 import subprocess
 import sys
+from operator import attrgetter
 from pathlib import Path
 
 import pytest
@@ -50,6 +51,20 @@ def test_every_page_and_every_notebook_is_in_the_navigation():
     notebooks = [f"notebooks/{path.name}" for path in (ROOT / "notebooks").glob("*.ipynb")]
     for page in pages + notebooks:
         assert f" {page}\n" in navigation
+
+
+def test_cross_references_of_docstrings_name_something_public():
+    """By the anchors that docs/hooks.py sets."""
+    anchors = set(public_names())
+    anchors |= {f"mj.{name}" for name in anchors}
+    for name in public_names():
+        thing = attrgetter(name)(mj)
+        members = vars(thing).values() if isinstance(thing, type) else ()
+        texts = [x.__doc__ or "" for x in (thing, *members)]
+        near = {x.removeprefix("multibody.") for x in anchors if name.startswith("multibody.")}
+        own = {f"{thing.__name__}.{x}" for x in vars(thing)} if isinstance(thing, type) else set()
+        for target in re.findall(r"\[`([\w.]+)`\]\[\]", "\n".join(texts)):
+            assert target in anchors | near | own, name
 
 
 # The others compile for longer.

@@ -46,7 +46,7 @@ class Assembly(eqx.Module):
         [`LinearActuator`][], [`Force`][], [`Torque`][].
     - `gravity` (m/s^2): shape `(2,)` or `(3,)`; `None` for none.
     - `redundant`: whether equations of joints depend on each other, as in most closed loops in
-        space that move in a plane. [`Assembly.state`][] says so.
+        space that move in a plane. `Assembly.state` says so.
 
     The coordinates are [`Pose`][]: positions of the centres of mass, and angles or unit
     quaternions with their norms as constraints. Joints of one kind are one array computation,

@@ -140,7 +140,7 @@ class Drive(AbstractRestraint):
     - `joint`: the name of a [`Revolute`][] or [`Prismatic`][], of which there may be one drive.
     - `motion`: its coordinate `x` (rad or m) as a function `f(t, args)` with two derivatives, or a
         number; that of [`JointSpring`][], but angles go on beyond `pi`.
-    - `name`: by default made of its joint. [`Assembly.joint_forces`][] has under it the torque or force
+    - `name`: by default made of its joint. `Assembly.joint_forces` has under it the torque or force
         of the drive.
 
     Where the torque is known instead of the motion, use [`Motor`][].
