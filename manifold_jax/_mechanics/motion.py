@@ -8,11 +8,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._custom_types import Args, BoolScalar, RealScalarLike, Y
-from .._linear import factorize, gram, gram_written_out
+from .._linear import Factorization, factorize, gram, gram_written_out, UNROLL_LIMIT
 from .._rows import AbstractRows, combine, multiply
 from .further import split
 from .kinematics import check_mechanical_state, Kinematics
 from .mass import directions_of
+from .saddle_point import Factored, solve_held_fixed
 
 
 # Of one equation among those that may depend on each other, beside the size of its terms.
@@ -45,6 +46,13 @@ class Motion:
     def solve(self, bias: Float[Array, " m"]) -> tuple[Float[Array, " n"], Float[Array, " m"]]:
         """Accelerations and multipliers of `M a + C^T lambda = Q`, `C a = -bias`."""
         force = self.force
+        if self._is_large() and isinstance(self.factorization, Factorization):
+            M = self.equations.mass_values(self.t, self.x, self.w, self.args)
+            factored = Factored(self.C, self.directions, self.mass, self.factorization)
+            accelerations, multipliers = solve_held_fixed(M, self.C, factored, force, -bias)
+            undefined = jnp.where(self.mass.valid & self.factorization.full_rank, 0, jnp.nan)
+            undefined = undefined.astype(force.dtype)
+            return accelerations + undefined, multipliers + undefined
         if self.mass.augmentation is not None:
             force = force - combine(self.mass.augmentation * bias, self.C)
         free = self.mass.solve(force)
@@ -62,6 +70,10 @@ class Motion:
             valid &= _agree(self.C, accelerations, bias)
         undefined = jnp.where(valid, 0, jnp.nan).astype(free.dtype)
         return accelerations + undefined, multipliers + undefined
+
+    def _is_large(self) -> bool:
+        """Whether the derivative of `C M^-1 C^T` would cost more than what is around it."""
+        return not isinstance(self.C, AbstractRows) and self.bias.size > UNROLL_LIMIT
 
     def constrained(self, b: Float[Array, " m"]) -> Float[Array, " n"]:
         """The smallest change of the velocities, in the metric of the masses, with `C dv = b`."""

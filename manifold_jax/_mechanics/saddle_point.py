@@ -1,0 +1,74 @@
+"""The equations of motion `M a + C^T lambda = Q`, `C a = r` as one linear system, and its derivative.
+
+By the rule of `A x = b`, `dx = A^-1 (db - dA x)`: the derivative of their elimination would be that of
+every entry of `C M^-1 C^T`, `m^2 n` operations for each direction, where products have `m n`.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from .._linear import Factorization
+from .._rows import combine, multiply
+from .mass import InvertedBlocks, Mass
+
+
+Pair = tuple[Float[Array, " n"], Float[Array, " m"]]
+
+
+class Factored(NamedTuple):
+    """What the system is solved with: `C`, the rows of `C M^-1`, `M` and `C M^-1 C^T` factored."""
+
+    C: Float[Array, "m n"]
+    directions: Float[Array, "m n"]
+    mass: Mass | InvertedBlocks
+    factorization: Factorization
+
+    def accelerations(self, force: Float[Array, " n"], r: Float[Array, " m"]) -> Pair:
+        """And multipliers."""
+        if self.mass.augmentation is not None:
+            force = force + combine(self.mass.augmentation * r, self.C)
+        free = self.mass.solve(force)
+        multipliers = self.factorization.solve(multiply(self.C, free) - r)
+        return free - combine(multipliers, self.directions), multipliers
+
+    def momenta(self, force: Float[Array, " n"], r: Float[Array, " m"]) -> Pair:
+        """`p = M a` and multipliers: `p + C^T lambda = Q`, `C M^-1 p = r`."""
+        multipliers = self.factorization.solve(multiply(self.C, self.mass.solve(force)) - r)
+        return force - combine(multipliers, self.C), multipliers
+
+    def momenta_transposed(self, f: Float[Array, " n"], r: Float[Array, " m"]) -> Pair:
+        """`u + M^-1 C^T mu = f`, `C u = r`."""
+        multipliers = self.factorization.solve(multiply(self.C, f) - r)
+        return f - combine(multipliers, self.directions), multipliers
+
+
+def solve_held_fixed(
+    M: Any, C: Float[Array, "m n"], factored: Factored, force: Float[Array, " n"], r: Any
+) -> Pair:
+    """Accelerations and multipliers, with the derivatives of `M` (as of `mass_values`), `C`, `force`
+    and `r`, but not of what was `factored`."""
+    factored = jax.lax.stop_gradient(factored)
+    if isinstance(M, InvertedBlocks):  # with M^-1 p in the place of a, as M is not known
+        momenta = lambda x: (x[0] + combine(x[1], C), multiply(C, M.solve(x[0])))
+        p, multipliers = jax.lax.custom_linear_solve(
+            momenta,
+            (force, r),
+            lambda _, b: factored.momenta(*b),
+            lambda _, b: factored.momenta_transposed(*b),
+        )
+        return M.solve(p), multipliers
+    both = lambda x: (_apply(M, x[0]) + combine(x[1], C), multiply(C, x[0]))
+    solve = lambda _, b: factored.accelerations(*b)
+    return jax.lax.custom_linear_solve(both, (force, r), solve, symmetric=True)
+
+
+def _apply(M: Float[Array, "..."], a: Float[Array, " n"]) -> Float[Array, " n"]:
+    """`M a`, with `M` in one of the forms of `mass_values`."""
+    if M.ndim < 2:
+        return M * a
+    if M.ndim == 2:
+        return M @ a
+    return jnp.sum(M * a.reshape(M.shape[0], 1, -1), axis=-1).reshape(-1)
