@@ -105,6 +105,8 @@ def test_a_start_that_is_not_finite(consistent):
     assert (sol.result == dfx.RESULTS.successful).tolist() == [True, False]
     assert (sol.result == dfx.RESULTS.nonlinear_divergence).tolist() == [False, True]
     assert sol.stats["num_steps"][1] == 0
+    forwards = solve(first, starts[1], throw=False, adjoint=dfx.ForwardMode(), **options)
+    assert forwards.stats["num_steps"] == 0
 
 
 @pytest.mark.parametrize("solver", [dfx.Bosh3(), mj.Rodas3P()], ids=["explicit", "Rosenbrock"])

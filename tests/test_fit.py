@@ -68,6 +68,17 @@ def test_standard_errors_are_those_of_the_linear_theory():
     np.testing.assert_allclose(free.prediction - free.residuals, noisy(positions(TS), sigma))
 
 
+def test_no_steps_below_the_errors_of_the_solves():
+    """Levenberg-Marquardt goes on until a step is accepted, and none is: until `patience` ends it."""
+    data = noisy(positions(TS), 0.05)
+    coarse = dfx.PIDController(rtol=1e-4, atol=1e-4)
+    result = fit_circle(data, sigma=0.05, stepsize_controller=coarse, patience=50)
+    exact = fit_circle(data, sigma=0.05)
+    assert len(result.history) < 15
+    for name, error in exact.standard_errors.items():
+        assert abs(result.parameters[name] - exact.parameters[name]) < 0.05 * error
+
+
 def test_missing_values_have_no_influence():
     data = noisy(positions(TS), 0.02)
     half = data.copy()

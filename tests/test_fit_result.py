@@ -152,7 +152,7 @@ def test_all_parameters_at_bounds():
 
 
 def test_a_parameter_put_on_its_bound_too_early_comes_off_again(monkeypatch):
-    monkeypatch.setattr(optimize, "_flat", lambda losses: True)
+    monkeypatch.setattr(optimize, "flat", lambda losses: True)
     monkeypatch.setattr(optimize, "driven", lambda *_: np.array([-1, 0]))
     result = radius_from(1.95)
     free = fit_circle(DATA, sigma=SIGMA)

@@ -14,9 +14,7 @@ from .._compat import (
     Progress,
     save_states,
     while_loop,
-    with_result,
 )
-from .._rejection import result_of_state
 from .backwards import Backwards, DenseBars
 from .gradient import Ends, TimesBar
 from .handed_out import HandedOut
@@ -101,8 +99,6 @@ class StepReplayAdjoint(dfx.AbstractAdjoint):
             )
         times = t0, t1, [sub.ts for sub in _subs(saveat)]
         dt0 = nondifferentiable(dt0, msg=_NO_STEP_SIZES)
-        # Else the error relative to it is NaN, and an adaptive controller rejects all of `max_steps`.
-        init_state = with_result(init_state, result_of_state(Progress.of(init_state).y))
 
         def run(outer_while_loop):
             return diffrax_loop(

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Array, Float
 
-from .objective import linearize, Objective, Solved
+from .objective import at_once, Objective, Solved
 from .parameters import LARGEST, Transform
 
 
@@ -82,11 +82,7 @@ def _near(u: Float[Array, " N"], transform: Transform, left: float) -> np.ndarra
 
 def _linear_step(u: Any, solved: Solved, objective: Objective) -> np.ndarray:
     """Of Gauss and Newton, `(N,)`."""
-    linear = linearize(u, solved, objective)
-    weight, N = np.asarray(objective.stiffness), u.size
-    J = np.concatenate([np.reshape(linear.J, (-1, N)), weight * np.reshape(linear.C, (-1, N))])
-    shifted = weight * (np.asarray(linear.gaps) + np.asarray(objective.shift))
-    r = np.concatenate([np.ravel(linear.r), np.ravel(shifted)])
+    J, r = at_once(u, solved, objective)
     size = np.linalg.norm(J, axis=0)
     size[size == 0] = 1.0
     return np.linalg.lstsq(J / size, -r, rcond=1e-6)[0] / size

@@ -8,6 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
+import numpy as np
 from jaxtyping import Array, Float
 
 from .._adjoint import StepReplayAdjoint
@@ -136,6 +137,15 @@ def linearize(u: Float[Array, " N"], solved: Solved, objective: Objective) -> Li
     values, p = objective.transform.values, objective.transform.start.size
     slopes = jax.jvp(values, (u[:p],), (jnp.ones_like(u[:p]),))[1]
     return Linearized(r, J, c, C, slopes)
+
+
+def at_once(u: Any, solved: Solved, objective: Objective) -> tuple[np.ndarray, np.ndarray]:
+    """The Jacobian `(n, N)` and the residuals `(n,)`, both of the data and of the joints."""
+    linear = jtu.tree_map(np.asarray, linearize(u, solved, objective))
+    weight, N = np.asarray(objective.stiffness), u.size
+    J = np.concatenate([linear.J.reshape(-1, N), weight * linear.C.reshape(-1, N)])
+    gaps = weight * (linear.gaps + np.asarray(objective.shift))
+    return J, np.concatenate([linear.r.ravel(), gaps.ravel()])
 
 
 def residuals(u: Float[Array, " N"], objective: Objective) -> tuple[Any, Any]:

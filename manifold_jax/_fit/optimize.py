@@ -18,6 +18,7 @@ from .bounds import (
     put_beside_bounds,
     put_on_bounds,
 )
+from .convergence import at_minimum, flat, stalled
 from .objective import gaps, Objective, residuals, Solved, total_loss
 from .progress import Meter
 
@@ -112,12 +113,14 @@ def _with_optimistix(
         meter.advance(losses[-1])
         if not okay:
             message = "a linear solve of the optimizer failed"
-        elif done or _stalled(losses, options.patience):
+        elif done or stalled(losses, options.patience):
             message = "converged"
         elif len(losses) > options.steps:
             message = f"not converged after {options.steps} steps"
-        elif _flat(losses) and np.any(driven(u, solved, objective) * movable):
+        elif flat(losses) and np.any(driven(u, solved, objective) * movable):
             message = "driven to a bound"
+        elif at_minimum(losses, u, solved, objective, solver):
+            message = "converged"
         else:
             u, done, okay = new, bool(new_done), bool(new_okay)
     return Outcome(u, solved, losses, losses[-1], message == "converged", message)
@@ -141,18 +144,6 @@ def _advance(solver: Any, u: Any, objective: Objective, state: Any) -> Any:
         u, state, seen = solver.step(function, u, objective, {}, state, frozenset())
         done, result = solver.terminate(function, u, objective, {}, state, frozenset())
     return u, state, seen, done, result == optx.RESULTS.successful
-
-
-def _stalled(losses: list[float], patience: int) -> bool:
-    """Whether `patience` steps have not lowered the loss by more than rounding."""
-    if len(losses) <= patience + 1:
-        return False
-    return min(losses[-patience:]) > min(losses[:-patience]) * (1 - 1e-9)
-
-
-def _flat(losses: list[float]) -> bool:
-    """Whether the last five steps have lowered the loss by less than a hundredth."""
-    return len(losses) > 5 and losses[-6] - losses[-1] <= 0.01 * abs(losses[-6])
 
 
 def _closing_gaps(
@@ -203,7 +194,7 @@ def _with_optax(
         losses.append(total)
         meter.advance(total)
         best = min(best, (total, begin if size is None else u), key=lambda pair: pair[0])
-        if _stalled(losses, options.patience):
+        if stalled(losses, options.patience):
             message = "the loss decreases no more"
             break
     solved = look(best[1], objective, optimizer)[1]

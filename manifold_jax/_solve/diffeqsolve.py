@@ -5,7 +5,7 @@ from typing import Any
 import diffrax as dfx
 import equinox as eqx
 
-from .._adjoint import LocatingAdjoint, StepReplayAdjoint
+from .._adjoint import CheckedStartAdjoint, LocatingAdjoint, StepReplayAdjoint
 from .._custom_types import Args, RealScalarLike, Y
 from .._errors import clear_errors
 from .._of_args import evaluated
@@ -93,6 +93,7 @@ def diffeqsolve(
     Source: Sudarsan & Keerthi, Appl. Math. Comput. 92 (1998) 153-193.
     """
     check_arguments(terms, solver, dt0, saveat, stepsize_controller, adjoint, event, consistent)
+    adjoint = CheckedStartAdjoint(adjoint)
     if event is not None and event.root_finder is not None:
         adjoint = LocatingAdjoint(adjoint)
     options = dict(

@@ -1,0 +1,21 @@
+"""A state that cannot be solved from ends the solve before its first step."""
+
+from typing import Any
+
+import diffrax as dfx
+
+from .._compat import LoopState, Progress, with_result
+from .._rejection import result_of_state
+
+
+class CheckedStartAdjoint(dfx.AbstractAdjoint):
+    """Another adjoint, in a solve whose initial state may be NaN.
+
+    The error relative to such a state is NaN, too, and an adaptive controller would reject all of
+    `max_steps` steps."""
+
+    adjoint: dfx.AbstractAdjoint
+
+    def loop(self, *, init_state: LoopState, **kwargs: Any) -> Any:
+        result = result_of_state(Progress.of(init_state).y)
+        return self.adjoint.loop(init_state=with_result(init_state, result), **kwargs)
