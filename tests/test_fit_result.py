@@ -12,7 +12,7 @@ import scipy.stats
 from fit_cases import fit_circle, noisy, positions, START, TRUTH, TS, TURN, Y0
 
 import manifold_jax as mj
-from manifold_jax._fit import optimize
+from manifold_jax._fit import convergence, optimize
 from manifold_jax._fit.parameters import make_transform
 from manifold_jax._fit.progress import Meter
 from manifold_jax._fit.starts import draw_points
@@ -158,6 +158,16 @@ def test_a_parameter_put_on_its_bound_too_early_comes_off_again(monkeypatch):
     free = fit_circle(DATA, sigma=SIGMA)
     assert result.at_bounds == ()
     np.testing.assert_allclose(result.parameters["radius"], free.parameters["radius"], rtol=1e-6)
+
+
+def test_a_record_that_fails_is_no_sign_of_the_minimum():
+    """Its constant, beside which all that is left to gain would seem small."""
+    J = np.array([[1.0], [1.0], [1.0], [0.0]])
+    offset = convergence.relative_offset
+    np.testing.assert_allclose(offset(J, np.array([0.1, -0.2, 0.1, 1e9])), 0, atol=1e-14)
+    expected = np.sqrt(0.03 / (0.11 - 0.03) * 2)  # along, across, n = 3, N = 1
+    np.testing.assert_allclose(offset(J, np.array([0.1, -0.1, 0.3, 1e9])), expected)
+    assert offset(J[:1], np.ones(1)) == np.inf
 
 
 def test_memory_of_standard_errors_grows_with_the_data_only():

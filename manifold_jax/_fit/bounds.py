@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Array, Float
 
-from .objective import at_once, Objective, Solved
+from .objective import Objective, Solved, stacked
 from .parameters import LARGEST, Transform
 
 
@@ -82,7 +82,7 @@ def _near(u: Float[Array, " N"], transform: Transform, left: float) -> np.ndarra
 
 def _linear_step(u: Any, solved: Solved, objective: Objective) -> np.ndarray:
     """Of Gauss and Newton, `(N,)`."""
-    J, r = at_once(u, solved, objective)
+    J, r = stacked(u, solved, objective)
     size = np.linalg.norm(J, axis=0)
     size[size == 0] = 1.0
     return np.linalg.lstsq(J / size, -r, rcond=1e-6)[0] / size

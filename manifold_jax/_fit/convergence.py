@@ -6,7 +6,7 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Float
 
-from .objective import at_once, Objective, Solved
+from .objective import Objective, Solved, stacked
 
 
 # What is left to a step, of what the noise of the data moves the minimum by.
@@ -29,21 +29,28 @@ def flat(losses: list[float]) -> bool:
 def at_minimum(
     losses: list[float], u: Float[Array, " N"], solved: Solved, objective: Objective, solver: Any
 ) -> bool:
-    r"""Whether steps are refused at the minimum, where errors of the solves are larger than what there
-    is left to gain: by the residuals along the columns of their Jacobian against those across,
-
-    $$\sqrt{\frac{\lVert P r\rVert^2 / N}{\lVert r - P r\rVert^2 / (n - N)}} \le 10^{-5}.$$
-
-    Source: Bates & Watts, A relative offset orthogonality convergence criterion for nonlinear least
-    squares, Technometrics 23 (1981) 179-183.
-    """
+    """Whether steps are refused at the minimum, where errors of the solves are larger than what there
+    is left to gain."""
     if not isinstance(solver, optx.AbstractLeastSquaresSolver) or not stalled(losses, _TRIALS):
         return False
-    J, r = at_once(u, solved, objective)
-    J = J[:, np.any(J != 0, axis=0)]
+    return relative_offset(*stacked(u, solved, objective)) <= _OFFSET
+
+
+def relative_offset(J: np.ndarray, r: np.ndarray) -> float:
+    r"""The residuals `(n,)` along the columns of their Jacobian `(n, N)` against those across,
+
+    $$\sqrt{\frac{\lVert P r\rVert^2 / N}{\lVert r - P r\rVert^2 / (n - N)}},$$
+
+    infinite for as many unknowns as residuals. Source: Bates & Watts, A relative offset orthogonality
+    convergence criterion for nonlinear least squares, Technometrics 23 (1981) 179-183.
+    """
+    # Neither what was not measured, nor the constants that stand for records whose solves failed.
+    known = np.any(J != 0, axis=1)
+    J, r = J[known][:, np.any(J != 0, axis=0)], r[known]
     n, N = J.shape
     if n <= N or N == 0:
-        return False
+        return np.inf
     Q = np.linalg.qr(J / np.linalg.norm(J, axis=0))[0]
-    along = np.sum((Q.T @ r) ** 2)
-    return bool(along / N <= _OFFSET**2 * (np.sum(r * r) - along) / (n - N))
+    along = Q @ (Q.T @ r)
+    across = np.linalg.norm(r - along)
+    return float(np.linalg.norm(along) / across * np.sqrt((n - N) / N)) if across > 0 else np.inf

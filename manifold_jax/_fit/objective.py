@@ -139,7 +139,7 @@ def linearize(u: Float[Array, " N"], solved: Solved, objective: Objective) -> Li
     return Linearized(r, J, c, C, slopes)
 
 
-def at_once(u: Any, solved: Solved, objective: Objective) -> tuple[np.ndarray, np.ndarray]:
+def stacked(u: Any, solved: Solved, objective: Objective) -> tuple[np.ndarray, np.ndarray]:
     """The Jacobian `(n, N)` and the residuals `(n,)`, both of the data and of the joints."""
     linear = jtu.tree_map(np.asarray, linearize(u, solved, objective))
     weight, N = np.asarray(objective.stiffness), u.size
