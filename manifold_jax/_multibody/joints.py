@@ -143,6 +143,7 @@ class Drive(AbstractRestraint):
     - `name`: by default made of its joint. `Assembly.joint_forces` has under it the torque or force
         of the drive.
 
+    `Assembly` raises `ValueError` for a joint that is not there, has several drives, or another kind.
     Where the torque is known instead of the motion, use [`Motor`][].
     """
 
