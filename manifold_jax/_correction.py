@@ -14,6 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ._custom_types import Args, BoolScalar, FloatScalar, IntScalar, RealScalarLike, Y
+from ._derivative_rule import ForwardRule
 from ._linear import factorize_once, gram, pseudo_invert
 from ._newton import AbstractEquations, chord, damped_newton, implicit_tangent
 from ._projection import NewtonProjection
@@ -177,7 +178,7 @@ def _correct_once(
     return CorrectionRoot(p, z, one, residual, factorization.full_rank, success)
 
 
-@eqx.filter_custom_jvp
+@ForwardRule
 def _solve(
     equations: CorrectionEquations,
     safe: Float[Array, " n"],
@@ -202,17 +203,16 @@ def _solve(
     return CorrectionRoot(p, root.z, root.iterations, root.level, full_rank, success)
 
 
-@_solve.def_jvp
-def _solve_jvp(primals, tangents):
+@_solve.define_jvp
+def _solve_jvp(root, primals, tangents):
     equations, safe, *_ = primals
-    root = _solve(*primals)
     # A failed projection may have met NaN. Move to a point where g is finite *before*
     # differentiating: selecting afterwards would leave 0 * NaN in reverse mode.
     equations = equations.starting_at(jnp.where(root.success, equations.x, safe))
     z = jnp.where(root.success, root.z, 0)
     dz, moved, crossing = implicit_tangent(equations, tangents[0], z)
     p_dot = moved + combine(dz, crossing.normals.directions)  # pyright: ignore[reportAttributeAccessIssue]
-    return root, CorrectionRoot(p_dot, dz, None, jnp.zeros_like(root.residual), None, None)  # pyright: ignore[reportArgumentType]
+    return CorrectionRoot(p_dot, dz, None, jnp.zeros_like(root.residual), None, None)  # pyright: ignore[reportArgumentType]
 
 
 def equations_of(

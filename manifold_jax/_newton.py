@@ -14,6 +14,7 @@ import jax.tree_util as jtu
 from jaxtyping import Array, Float
 
 from ._custom_types import BoolScalar, FloatScalar, IntScalar
+from ._derivative_rule import ForwardRule
 
 
 @runtime_checkable
@@ -182,18 +183,17 @@ def _derivative(f: Callable, x: Any, tangent: Any) -> tuple[Array, Array]:
     return value, jnp.zeros_like(value) if slope is None else slope
 
 
-@eqx.filter_custom_jvp
+@ForwardRule
 def implicit_root(equations: AbstractEquations, root: Float[Array, " m"]) -> Float[Array, " m"]:
     """`root` itself, as the function of the leaves of `equations` that they define."""
     del equations
     return root
 
 
-@implicit_root.def_jvp
-def _implicit_root_jvp(primals, tangents):
-    equations, root = primals
-    root = implicit_root(equations, root)  # of which the rule can be differentiated again
-    return root, implicit_tangent(equations, tangents[0], root).dz
+@implicit_root.define_jvp
+def _implicit_root_jvp(root, primals, tangents):
+    (equations, _), (moved, _) = primals, tangents
+    return implicit_tangent(equations, moved, root).dz
 
 
 def without_derivative(tree: Any) -> Any:

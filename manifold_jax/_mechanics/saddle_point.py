@@ -52,17 +52,27 @@ def solve_held_fixed(
     and `r`, but not of what was `factored`."""
     factored = jax.lax.stop_gradient(factored)
     if isinstance(M, InvertedBlocks):  # with M^-1 p in the place of a, as M is not known
-        momenta = lambda x: (x[0] + combine(x[1], C), multiply(C, M.solve(x[0])))
-        p, multipliers = jax.lax.custom_linear_solve(
-            momenta,
-            (force, r),
-            lambda _, b: factored.momenta(*b),
-            lambda _, b: factored.momenta_transposed(*b),
+        momenta = lambda p, z: (p + combine(z, C), multiply(C, M.solve(p)))
+        p, multipliers = _solve_linear(
+            momenta, force, r, factored.momenta, factored.momenta_transposed
         )
         return M.solve(p), multipliers
-    both = lambda x: (_apply(M, x[0]) + combine(x[1], C), multiply(C, x[0]))
-    solve = lambda _, b: factored.accelerations(*b)
-    return jax.lax.custom_linear_solve(both, (force, r), solve, symmetric=True)
+    both = lambda a, z: (_apply(M, a) + combine(z, C), multiply(C, a))
+    return _solve_linear(both, force, r, factored.accelerations, factored.accelerations)
+
+
+def _solve_linear(product: Any, force: Any, r: Any, solve: Any, solve_transposed: Any) -> Pair:
+    """Both unknowns in one vector: `custom_linear_solve` cannot be differentiated where only one of
+    several right-hand sides depends on something (JAX 0.10.2 and 0.12.0)."""
+    n = force.size
+    as_one = lambda f: lambda x: jnp.concatenate(f(x[:n], x[n:]))
+    x = jax.lax.custom_linear_solve(
+        as_one(product),
+        jnp.concatenate([force, r]),
+        lambda _, b: as_one(solve)(b),
+        lambda _, b: as_one(solve_transposed)(b),
+    )
+    return x[:n], x[n:]
 
 
 def _apply(M: Float[Array, "..."], a: Float[Array, " n"]) -> Float[Array, " n"]:

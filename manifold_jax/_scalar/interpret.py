@@ -17,7 +17,7 @@ from .value import Value
 
 _CALLS = frozenset(
     "jit pjit closed_call core_call custom_jvp_call custom_vjp_call custom_vjp_call_jaxpr remat2 "
-    "checkpoint".split()
+    "checkpoint call_with_derivative_rule".split()
 )
 _CONTROL = {
     "cond": control.cond,

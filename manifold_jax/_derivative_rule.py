@@ -1,0 +1,115 @@
+"""Functions with a derivative rule of their own, of which derivatives of any order are right.
+
+`jax.custom_jvp` forgets its rule where JAX evaluates a loop partially, as reverse mode does with
+`lax.scan`: the first derivative still follows the rule, but a second one differentiates the function
+itself (seen with JAX 0.10.2 and 0.12.0: a root that is found under `stop_gradient` has then none).
+An operation of its own keeps the rule through every transformation.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jax.extend.core import jaxpr_as_fun, Primitive
+from jax.interpreters import ad, batching, mlir
+
+
+class ForwardRule:
+    """A function of pytrees with a rule for its derivative in forward mode, written as
+
+        @ForwardRule
+        def function(*arguments): ...
+
+        @function.define_jvp
+        def rule(values, primals, tangents): ...
+
+    `values` is what the function returns at `primals`; `rule` returns its tangents. Of leaves that
+    are not differentiated, or not real numbers, tangents are `None`, in both directions. Reverse mode
+    transposes the rule. All arrays must be in the arguments, none closed over.
+    """
+
+    def __init__(self, function: Callable):
+        self._function = function
+        self._rule: Callable | None = None
+        self.__doc__ = function.__doc__
+        self.__name__ = function.__name__
+
+    def define_jvp(self, rule: Callable) -> Callable:
+        self._rule = rule
+        return rule
+
+    def __call__(self, *args: Any) -> Any:
+        arrays, static = eqx.partition(args, eqx.is_array)
+        leaves, inputs = jtu.tree_flatten(arrays)
+        known: list[Any] = []
+
+        def flat(*leaves: Any) -> list[Any]:
+            out = self._function(*eqx.combine(jtu.tree_unflatten(inputs, leaves), static))
+            out_arrays, out_static = eqx.partition(out, eqx.is_array)
+            out_leaves, outputs = jtu.tree_flatten(out_arrays)
+            known.append((outputs, out_static))
+            return out_leaves
+
+        closed = jax.make_jaxpr(flat)(*leaves)
+        outputs, out_static = known[0]
+
+        def flat_rule(values: list, primals: list, tangents: list) -> list:
+            value = eqx.combine(jtu.tree_unflatten(outputs, values), out_static)
+            primal = eqx.combine(jtu.tree_unflatten(inputs, primals), static)
+            assert self._rule is not None
+            along = self._rule(value, primal, jtu.tree_unflatten(inputs, tangents))
+            return outputs.flatten_up_to(along)
+
+        out = _ruled.bind(*leaves, call_jaxpr=closed, rule=flat_rule)
+        return eqx.combine(jtu.tree_unflatten(outputs, out), out_static)
+
+
+# The operation: `call_jaxpr` is evaluated, `rule(values, primals, tangents)` is its derivative.
+_ruled = Primitive("call_with_derivative_rule")
+_ruled.multiple_results = True
+
+
+@_ruled.def_impl
+def _evaluate(*primals: Any, call_jaxpr: Any, rule: Callable) -> list:
+    del rule
+    return jaxpr_as_fun(call_jaxpr)(*primals)
+
+
+@_ruled.def_effectful_abstract_eval
+def _shapes(*primals: Any, call_jaxpr: Any, rule: Callable) -> tuple[list, Any]:
+    del primals, rule
+    return call_jaxpr.out_avals, call_jaxpr.effects
+
+
+def _differentiate(primals: Any, tangents: Any, *, call_jaxpr: Any, rule: Callable) -> tuple:
+    values = _ruled.bind(*primals, call_jaxpr=call_jaxpr, rule=rule)
+    given = [_none_if_zero(x, dx) for x, dx in zip(primals, tangents, strict=True)]
+    found = rule(values, list(primals), given)
+    zero = lambda x: ad.Zero(jax.typeof(x).to_tangent_aval())
+    along = [zero(x) if dx is None else dx for x, dx in zip(values, found, strict=True)]
+    return values, along
+
+
+def _none_if_zero(x: Any, dx: Any) -> Any:
+    undifferentiated = type(dx) is ad.Zero or not jnp.issubdtype(x.dtype, jnp.inexact)
+    return None if undifferentiated else dx
+
+
+def _batch(primals: Any, axes: Any, *, call_jaxpr: Any, rule: Callable) -> tuple:
+    axes = [axis if isinstance(axis, int) else None for axis in axes]
+
+    def mapped_rule(values: list, primals: list, tangents: list) -> list:
+        given = [None if dx is None else axis for dx, axis in zip(tangents, axes, strict=True)]
+        return jax.vmap(rule, ([0] * len(values), axes, given))(values, primals, tangents)
+
+    closed = jax.make_jaxpr(jax.vmap(jaxpr_as_fun(call_jaxpr), axes))(*primals)
+    out = _ruled.bind(*primals, call_jaxpr=closed, rule=mapped_rule)
+    return out, [0] * len(out)
+
+
+ad.primitive_jvps[_ruled] = _differentiate
+batching.primitive_batchers[_ruled] = _batch
+mlir.register_lowering(_ruled, mlir.lower_fun(_evaluate, multiple_results=True))
