@@ -13,6 +13,7 @@ import jax.flatten_util as jfu
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from ._closure import convert_closure
 from ._custom_types import Args, BoolScalar, FloatScalar, IntScalar, RealScalarLike, Y
 from ._derivative_rule import ForwardRule
 from ._linear import factorize_once, gram, pseudo_invert
@@ -229,7 +230,7 @@ def equations_of(
     x, unravel = jfu.ravel_pytree(y)
     t = as_time(t, x.dtype)
     # Parameters that the residual closes over become inputs, so that they are differentiated.
-    residual = eqx.filter_closure_convert(
+    residual = convert_closure(
         lambda t, x, args: residual_vector(function, t, unravel(x), args), t, x, args
     )
     metric = projection.inverse_metric(y)

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array
 
+from .._closure import convert_closure
 from .._compat import LoopState, Progress
 from .._custom_types import Args, RealScalarLike, Y
 from .._projection_info import ProjectionInfo
@@ -53,7 +54,7 @@ class Replay(eqx.Module):
             after, dense_info = solve.attempt(start, end, jumped, state)
             return after, dense_info if interpolates else None
 
-        convert = eqx.filter_closure_convert
+        convert = convert_closure
         example = t, t, t != t if solve.jumps else False, start
         step = convert(step, *example)
         _, dense_info = eqx.filter_eval_shape(step, *example)

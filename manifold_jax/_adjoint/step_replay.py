@@ -7,6 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import jax.tree_util as jtu
 
+from .._closure import convert_closure
 from .._compat import (
     diffrax_loop,
     is_unsafe_sde,
@@ -133,7 +134,7 @@ class StepReplayAdjoint(dfx.AbstractAdjoint):
             return recording(record, solve.state, run)
 
         # What the functions close over becomes their leaves, which have derivatives.
-        forward = eqx.filter_closure_convert(forward, record)
+        forward = convert_closure(forward, record)
         differentiable = replay, start, times, forward
         rest, handed_out = _solve(differentiable, record, solve.remembers)
         final_state, statistics = _without_derivative(rest)

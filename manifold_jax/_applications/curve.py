@@ -11,6 +11,7 @@ from diffrax import RESULTS
 from jaxtyping import Array, Float
 
 from .._adjoint import StepReplayAdjoint
+from .._closure import convert_closure
 from .._compat import nonlinear_failure
 from .._constraint_checks import check_state
 from .._custom_types import Args, IntScalar, RealScalarLike
@@ -135,7 +136,7 @@ def trace_curve(
         raise ValueError(f"{_MESSAGES[4]} Got {length}.")
     length = jnp.asarray(length, x0.dtype)
 
-    curve = Curve(eqx.filter_closure_convert(function, x0, args), args, jnp.ones((), x0.dtype))
+    curve = Curve(convert_closure(function, x0, args), args, jnp.ones((), x0.dtype))
     curve, start, info, faults = start_on(curve, x0, as_direction(direction, x0, parameter))
     positive = (length > 0) & jnp.isfinite(length)
     arclengths = jnp.linspace(0, jnp.where(positive, length, 1), points, dtype=x0.dtype)

@@ -12,6 +12,7 @@ import jax.tree_util as jtu
 from diffrax import RESULTS
 from jaxtyping import Array, Bool, Float
 
+from .._closure import convert_closure
 from .._compat import is_okay, nonlinear_failure
 from .._constraint import AbstractConstraint, Constraint
 from .._constraint_checks import check_constraint, check_state
@@ -149,8 +150,8 @@ def gradient_flow(
         raise ValueError(f"`tolerance` must be between 0 and 1, got {tolerance}.")
     start, unravel = jfu.ravel_pytree(x0)
     lagrangian = Lagrangian(
-        eqx.filter_closure_convert(lambda x, args: objective(unravel(x), args), start, args),
-        eqx.filter_closure_convert(
+        convert_closure(lambda x, args: objective(unravel(x), args), start, args),
+        convert_closure(
             lambda x, args: residual_vector(constraint, 0.0, unravel(x), args), start, args
         ),
         args,

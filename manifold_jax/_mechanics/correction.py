@@ -13,11 +13,11 @@ MEXX (1992).
 import dataclasses
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from .._closure import convert_closure
 from .._correction import CorrectionEquations, CorrectionRoot, Crossing, Normals, solve_correction
 from .._custom_types import Args, BoolScalar, Y
 from .._projection import NewtonProjection
@@ -106,7 +106,7 @@ class TwoStages(NamedTuple):
         if self.equations.nonholonomic is not None or self.metrics is not None:
             normals = self._position_normals(x, crossing.normals, p)
             crossing = Crossing.of(normals, self.redundant)
-        residual = eqx.filter_closure_convert(self.equations.position, self.t, x, self.args)
+        residual = convert_closure(self.equations.position, self.t, x, self.args)
         return self._solve(residual, x, self.args, safe, crossing, far)
 
     def _position_normals(self, x, normals: Normals, p: int) -> Normals:
@@ -120,7 +120,7 @@ class TwoStages(NamedTuple):
 
     def _velocities(self, x, w, safe, crossing: Crossing, far: bool) -> CorrectionRoot:
         context = (x, self.args)
-        residual = eqx.filter_closure_convert(self.equations.velocity, self.t, w, context)
+        residual = convert_closure(self.equations.velocity, self.t, w, context)
         return self._solve(residual, w, context, safe, crossing, far)
 
     def _solve(self, residual, x, args, safe, crossing: Crossing, far: bool) -> CorrectionRoot:

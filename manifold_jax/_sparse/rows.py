@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from .._closure import convert_closure
 from .._custom_types import Args
 from .._rows import AbstractRows
 from .factorization import BlockFactorization
@@ -35,7 +36,7 @@ class SparseRows(AbstractRows):
     @staticmethod
     def of(function: Callable, t, x, args, structure: Structure) -> "SparseRows":
         # What the function closes over becomes an input, so that it is differentiated.
-        function = eqx.filter_closure_convert(function, t, x, args)
+        function = convert_closure(function, t, x, args)
         return SparseRows(function, t, x, args, structure)
 
     def along(self, metric: Metric) -> "SparseRows":
