@@ -85,9 +85,10 @@ def _shapes(*primals: Any, call_jaxpr: Any, rule: Callable) -> tuple[list, Any]:
 
 
 def _differentiate(primals: Any, tangents: Any, *, call_jaxpr: Any, rule: Callable) -> tuple:
+    primals = [jnp.asarray(x, x.dtype) for x in primals]  # literals of a traced function
     values = _ruled.bind(*primals, call_jaxpr=call_jaxpr, rule=rule)
     given = [_none_if_zero(x, dx) for x, dx in zip(primals, tangents, strict=True)]
-    found = rule(values, list(primals), given)
+    found = rule(values, primals, given)
     zero = lambda x: ad.Zero(jax.typeof(x).to_tangent_aval())
     along = [zero(x) if dx is None else dx for x, dx in zip(values, found, strict=True)]
     return values, along

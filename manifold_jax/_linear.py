@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ._custom_types import BoolScalar, FloatScalar
+from ._derivative_rule import ForwardRule
 
 
 # Number of operations grows like m^3 / 3: 170 at m = 8, still less than one library call.
@@ -142,7 +143,7 @@ class PseudoInverse(eqx.Module):
     """`A^+`: for equations that depend on each other the solution of least norm, where the matrix is
     equilibrated with each unknown multiplied by the square root of its diagonal entry.
 
-    Its derivative (constant rank; Golub & Pereyra 1973) is that of `jnp.linalg.pinv`.
+    Its derivative is that at constant rank (Golub & Pereyra 1973).
     """
 
     inverse: Float[Array, "m m"]
@@ -194,8 +195,26 @@ def pseudo_invert(
         diagonal = jax.lax.stop_gradient(jnp.diagonal(A))
         size = jnp.where(diagonal > 0, 1 / jnp.sqrt(jnp.where(diagonal > 0, diagonal, 1)), 1)
         scale = size[:, None] * size[None, :]
-    inverse = scale * jnp.linalg.pinv(scale * A, rtol=dependent, hermitian=True)
-    return PseudoInverse(inverse, finite)
+    dependent = jax.lax.stop_gradient(jnp.asarray(dependent, A.dtype))
+    return PseudoInverse(scale * _pseudo_inverse(scale * A, dependent), finite)
+
+
+@ForwardRule
+def _pseudo_inverse(A: Float[Array, "m m"], dependent: FloatScalar) -> Float[Array, "m m"]:
+    """Of a symmetric matrix. (The derivative of `jnp.linalg.pinv` cannot be differentiated again
+    where `rtol` is an array.)"""
+    values, V = jnp.linalg.eigh(A, symmetrize_input=False)
+    used = jnp.abs(values) > dependent * jnp.max(jnp.abs(values))
+    return (V * jnp.where(used, 1 / jnp.where(used, values, 1), 0)) @ V.T
+
+
+@_pseudo_inverse.define_jvp
+def _pseudo_inverse_jvp(P, primals, tangents):
+    """At constant rank (Golub & Pereyra 1973)."""
+    (A, _), (A_dot, _) = primals, tangents
+    one = jnp.eye(A.shape[0], dtype=A.dtype)
+    turned = P @ P @ A_dot.T @ (one - A @ P)
+    return turned + turned.T - P @ A_dot @ P
 
 
 def _factorize_with_library(A: Float[Array, "m m"]) -> Factorization:

@@ -196,6 +196,20 @@ def _implicit_root_jvp(root, primals, tangents):
     return implicit_tangent(equations, moved, root).dz
 
 
+@ForwardRule
+def root_of_step(step: Callable[[Array], Array], root: Array) -> Array:
+    """`root` itself, as the function of the leaves of `step` that they define: `step(x)` is Newton's
+    step `-A^-1 r` at `x`, of which the derivative at a root is that of the root."""
+    del step
+    return root
+
+
+@root_of_step.define_jvp
+def _root_of_step_jvp(root, primals, tangents):
+    (step, _), (moved, _) = primals, tangents
+    return _derivative(lambda step: step(root), step, moved)[1]
+
+
 def without_derivative(tree: Any) -> Any:
     """`tree` with all its arrays held fixed."""
     return jtu.tree_map(lambda x: jax.lax.stop_gradient(x) if eqx.is_inexact_array(x) else x, tree)

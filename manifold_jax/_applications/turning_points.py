@@ -8,8 +8,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from .._closure import convert_closure
 from .._custom_types import FloatScalar, IntScalar
-from .._newton import without_derivative
+from .._newton import root_of_step, without_derivative
 from .following import Curve, Nodes
 
 
@@ -54,10 +55,14 @@ def find_turns(
         ends = tuple(jnp.where(found, nodes.s[step + i], 0) for i in range(2))
         fixed = without_derivative((curve, path))
         root = _bracketed_root(lambda s: slope(*fixed, s), ends, (slopes[step], slopes[step + 1]))  # pyright: ignore[reportArgumentType, reportCallIssue]
+
+        def step(s):
+            at = lambda s: slope(curve, path, s)
+            value, rate = jax.jvp(at, (s,), (jnp.ones_like(s),))
+            return -jnp.where(found, value / jnp.where(found, rate, 1), 0)
+
         root = jax.lax.stop_gradient(root)
-        _, rate = jax.jvp(lambda s: slope(*fixed, s), (root,), (jnp.ones_like(root),))  # pyright: ignore[reportCallIssue]
-        correction = slope(curve, path, root) / jnp.where(found, rate, 1)
-        s = root - jnp.where(found, correction, 0)
+        s = root_of_step(convert_closure(step, root), root)
         return s, path.evaluate(s)
 
     return Turns(count, found, *jax.vmap(locate)(before, found))

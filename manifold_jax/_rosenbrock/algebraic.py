@@ -21,7 +21,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from .._closure import convert_closure
 from .._custom_types import BoolScalar, FloatScalar, IntScalar, RealScalarLike
+from .._newton import root_of_step
 from .._projection_info import ProjectionInfo
 from .elimination import factorize_pivoted
 
@@ -169,7 +171,7 @@ def consistent(
 ) -> tuple[Float[Array, " n"], ProjectionInfo]:
     """`x` with the part that `M` does not see corrected; `x` itself where that fails.
 
-    Iterated without derivatives; one Newton step that changes nothing has them.
+    Iterated without derivatives; those of the root are those of Newton's step there.
     """
     unit = 4 * jnp.finfo(x.dtype).eps
     fixed, t_fixed = jax.lax.stop_gradient((x, t))
@@ -208,9 +210,12 @@ def consistent(
     # Where equations are badly conditioned steps end at many units of rounding.
     success = (end.size <= 1e3 * unit) | (end.residual <= 10 * unit)
     moved = jax.lax.stop_gradient(jnp.where(success, end.x, fixed))
-    there = equations.at(t, moved)
-    change = there.newton + there.kept(x - moved)
-    out = jnp.where(success, moved + (change - jax.lax.stop_gradient(change)), x)
+
+    def step(moved):
+        there = equations.at(t, moved)
+        return there.newton + there.kept(x - moved)
+
+    out = jnp.where(success, root_of_step(convert_closure(step, moved), moved), x)
     info = ProjectionInfo(
         multipliers=jnp.zeros((0,), x.dtype),
         iterations=end.iterations,
