@@ -91,6 +91,11 @@ def with_result(state: LoopState, result: RESULTS) -> LoopState:
     return eqx.tree_at(lambda s: s.result, state, update_result(state.result, result))
 
 
+def with_next_time(state: LoopState, tnext: Any) -> LoopState:
+    """A solve whose next step ends there."""
+    return eqx.tree_at(lambda s: s.tnext, state, tnext)
+
+
 class Progress(NamedTuple):
     """How far a solve is: where its next step begins and ends, from what, and how many there were."""
 

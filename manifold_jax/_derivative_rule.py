@@ -111,6 +111,99 @@ def _batch(primals: Any, axes: Any, *, call_jaxpr: Any, rule: Callable) -> tuple
     return out, [0] * len(out)
 
 
+def apply_linear(
+    forward: Callable, transpose: Callable, like: Any, primals: Any, tangents: Any
+) -> Any:
+    """`forward(primals, tangents)`, linear in the tangents, with `transpose(primals, cotangents)`
+    as what reverse mode does instead of transposing it operation by operation.
+
+    Tangents and cotangents are `None` where there are none. What is returned looks like the
+    arrays `like`; neither function is traced before it is needed.
+    """
+    (primal_leaves, in_tree), (tangent_leaves, along) = map(jtu.tree_flatten, (primals, tangents))
+    like_leaves, out_tree = jtu.tree_flatten(like)
+
+    def flat_forward(primals: list, tangents: list) -> list:
+        out = forward(jtu.tree_unflatten(in_tree, primals), jtu.tree_unflatten(along, tangents))
+        found = zip(like_leaves, out_tree.flatten_up_to(out), strict=True)
+        return [jnp.zeros_like(x) if dx is None else dx for x, dx in found]
+
+    def flat_transpose(primals: list, cotangents: list) -> list:
+        bar = jtu.tree_unflatten(out_tree, cotangents)
+        return along.flatten_up_to(transpose(jtu.tree_unflatten(in_tree, primals), bar))
+
+    out = _linear.bind(
+        *primal_leaves,
+        *tangent_leaves,
+        forward=flat_forward,
+        transpose=flat_transpose,
+        num_primals=len(primal_leaves),
+        avals=tuple(jax.typeof(x).to_tangent_aval() for x in like_leaves),
+    )
+    return jtu.tree_unflatten(out_tree, out)
+
+
+# The operation: `forward(primals, tangents)`.
+_linear = Primitive("linear_with_transpose_rule")
+_linear.multiple_results = True
+
+
+@_linear.def_impl
+def _evaluate_linear(*operands: Any, forward: Callable, num_primals: int, **_: Any) -> list:
+    return forward(list(operands[:num_primals]), list(operands[num_primals:]))
+
+
+@_linear.def_abstract_eval
+def _shapes_of_linear(*operands: Any, avals: tuple, **_: Any) -> tuple:
+    del operands
+    return avals
+
+
+def _differentiate_linear(operands: Any, along: Any, **params: Any) -> tuple:
+    k, forward = params["num_primals"], params["forward"]
+    operands = [jnp.asarray(x, x.dtype) for x in operands]
+    primals, tangents = operands[:k], operands[k:]
+    out = _linear.bind(*operands, **params)
+    given = [ad.instantiate_zeros(dx) for dx in along]
+    total = _linear.bind(*primals, *given[k:], **params)
+    if any(_none_if_zero(x, dx) is not None for x, dx in zip(primals, along, strict=False)):
+        _, more = jax.jvp(lambda primals: forward(primals, tangents), (primals,), (given[:k],))
+        total = [a + b for a, b in zip(total, more, strict=True)]
+    return out, total
+
+
+def _transpose_linear(cotangents: Any, *operands: Any, **params: Any) -> list:
+    k = params["num_primals"]
+    given = [None if type(bar) is ad.Zero else bar for bar in cotangents]
+    return [None] * k + params["transpose"](list(operands[:k]), given)
+
+
+def _batch_linear(operands: Any, axes: Any, **params: Any) -> tuple:
+    k, forward, transpose = params["num_primals"], params["forward"], params["transpose"]
+    (size,) = {x.shape[a] for x, a in zip(operands, axes, strict=True) if isinstance(a, int)}
+    primal_axes = [a if isinstance(a, int) else None for a in axes[:k]]
+    tangents = [
+        jnp.moveaxis(x, a, 0) if isinstance(a, int) else jnp.broadcast_to(x, (size, *x.shape))
+        for x, a in zip(operands[k:], axes[k:], strict=True)
+    ]
+
+    def mapped_transpose(primals: list, cotangents: list) -> list:
+        given = [None if bar is None else 0 for bar in cotangents]
+        return jax.vmap(transpose, (primal_axes, given), axis_size=size)(primals, cotangents)
+
+    params |= dict(
+        forward=jax.vmap(forward, (primal_axes, 0), axis_size=size),
+        transpose=mapped_transpose,
+        avals=tuple(aval.update(shape=(size, *aval.shape)) for aval in params["avals"]),
+    )
+    out = _linear.bind(*operands[:k], *tangents, **params)
+    return out, [0] * len(out)
+
+
+ad.primitive_jvps[_linear] = _differentiate_linear
+ad.primitive_transposes[_linear] = _transpose_linear
+batching.primitive_batchers[_linear] = _batch_linear
+mlir.register_lowering(_linear, mlir.lower_fun(_evaluate_linear, multiple_results=True))
 ad.primitive_jvps[_ruled] = _differentiate
 batching.primitive_batchers[_ruled] = _batch
 mlir.register_lowering(_ruled, mlir.lower_fun(_evaluate, multiple_results=True))

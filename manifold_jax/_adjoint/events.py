@@ -11,6 +11,7 @@ import optimistix as optx
 from diffrax import RESULTS
 from jaxtyping import Array, Bool, Float
 
+from .._closure import convert_closure
 from .._compat import (
     Ending,
     LastStep,
@@ -22,6 +23,7 @@ from .._compat import (
     update_result,
 )
 from .._custom_types import Args, BoolScalar, FloatScalar, IntScalar, Y
+from .._newton import root_of_step
 from .._solver.base import AbstractManifoldSolver
 
 
@@ -124,7 +126,13 @@ class _EventsInStep:
 
         options = dict(lower=self.start, upper=self.end)
         root = optx.root_find(value, self.root_finder, self.end, options=options, throw=False)  # pyright: ignore[reportArgumentType]
-        return root.value, root.result
+
+        def step(t):
+            there, rate = jax.jvp(lambda t: value(t, None), (t,), (jnp.ones_like(t),))
+            return -there / jnp.where(rate == 0, 1, rate)
+
+        at = lax.stop_gradient(root.value)
+        return root_of_step(convert_closure(step, at), at), root.result
 
 
 def _ending(

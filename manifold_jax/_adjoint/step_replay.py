@@ -16,12 +16,14 @@ from .._compat import (
     save_states,
     while_loop,
 )
+from .._derivative_rule import apply_linear, ForwardRule
 from .backwards import Backwards, DenseBars
 from .gradient import Ends, TimesBar
 from .handed_out import HandedOut
 from .record import Record, recording
 from .replay import Replay, Solve
 from .saved import Functions, Rows, SavedValues
+from .sizes_held_fixed import SizesHeldFixed, with_end_held_fixed
 
 
 class StepReplayAdjoint(dfx.AbstractAdjoint):
@@ -104,7 +106,7 @@ class StepReplayAdjoint(dfx.AbstractAdjoint):
         def run(outer_while_loop):
             return diffrax_loop(
                 solver=_with_loops(solver, "lax"),
-                stepsize_controller=stepsize_controller,
+                stepsize_controller=SizesHeldFixed(stepsize_controller),
                 event=event,
                 saveat=saveat,
                 t0=t0,
@@ -113,7 +115,7 @@ class StepReplayAdjoint(dfx.AbstractAdjoint):
                 max_steps=max_steps,
                 terms=terms,
                 args=args,
-                init_state=init_state,
+                init_state=with_end_held_fixed(init_state, t1),
                 inner_while_loop=_while_loop,
                 outer_while_loop=outer_while_loop,
                 progress_meter=progress_meter,
@@ -136,14 +138,17 @@ class StepReplayAdjoint(dfx.AbstractAdjoint):
         # What the functions close over becomes their leaves, which have derivatives.
         forward = convert_closure(forward, record)
         differentiable = replay, start, times, forward
-        rest, handed_out = _solve(differentiable, record, solve.remembers)
-        final_state, statistics = _without_derivative(rest)
+        (final_state, statistics), handed_out, _ = _solve(differentiable, record, solve.remembers)
         return handed_out.put_into(final_state), statistics
 
 
 _NO_STEP_SIZES = (
     "`dt0` has no derivative with `adjoint=StepReplayAdjoint()`, the default: what a solution depends on step sizes is "
     "its error. Pass `jax.lax.stop_gradient(dt0)`."
+)
+_TWICE_BACKWARDS = (
+    "The gradient of `adjoint=StepReplayAdjoint()`, the default, cannot be differentiated in reverse mode again. Write "
+    "`jax.jacfwd(jax.grad(f))`, or pass `adjoint=diffrax.DirectAdjoint()`."
 )
 _UNBOUNDED = (
     "`max_steps` is None, but reverse mode needs room for the steps it records: pass a positive integer, or "
@@ -155,52 +160,63 @@ def _while_loop(*args: Any, checkpoints: Any = None, **kwargs: Any) -> Any:
     return while_loop(*args, kind="lax", **kwargs)
 
 
-@eqx.filter_custom_jvp
-def _without_derivative(tree):
-    """Whole numbers, too: JAX gives those that leave a `custom_vjp` a derivative of their own kind,
-    which not every operation takes."""
-    return tree
-
-
-@_without_derivative.def_jvp
-def _no_derivative(primals, tangents):
-    (tree,), _ = primals, tangents
-    return tree, jtu.tree_map(lambda leaf: None, tree)
-
-
-@eqx.filter_custom_vjp
+@ForwardRule
 def _solve(differentiable, record, remembers):
-    *_, forward = differentiable
-    out, _ = forward(record)
-    return out, HandedOut.of(out[0], remembers)
+    """What the loop returns, what has derivatives of that, and what reverse mode needs."""
+    *_, run = differentiable
+    (state, statistics), record = run(record)
+    return (state, statistics), HandedOut.of(state, remembers), (record, state)
 
 
-@_solve.def_fwd
-def _forward(perturbed, differentiable, record, remembers):
-    del perturbed
-    *_, forward = differentiable
-    out, record = forward(record)
-    state, _ = out
-    handed_out = HandedOut.of(state, remembers)
-    counts = [(s.ts, s.saveat_ts_index) for s in save_states(state)]
-    end = Progress.of(state)
-    last = end.tprev, end.num_steps, end.num_accepted_steps, end.y
-    return (out, handed_out), (record, last, counts, handed_out)
+@_solve.define_jvp
+def _solve_jvp(values, primals, tangents):
+    """Forwards the loop itself is differentiated, backwards its record is gone through."""
+    (differentiable, empty, remembers), (moved, *_) = primals, tangents
+    structure = jtu.tree_structure(differentiable)
+    given = structure.flatten_up_to(moved)
+    perturbed = jtu.tree_unflatten(structure, [dx is not None for dx in given])
+    arrays, static = eqx.partition((differentiable, empty, values), eqx.is_array)
+
+    def forward(arrays, tangents):
+        differentiable, empty, _ = eqx.combine(arrays, static)
+        each = iter(tangents)
+        along = [None if dx is None else next(each) for dx in given]
+        *_, along = jtu.tree_unflatten(structure, along)
+
+        def final(run):
+            (state, _), record = run(empty)
+            values = HandedOut.of(state, remembers), (record, state)
+            return eqx.filter(values, eqx.is_inexact_array)
+
+        return eqx.filter_jvp(final, (differentiable[-1],), (along,))[1]
+
+    def transpose(arrays, bar):
+        differentiable, _, values = eqx.combine(arrays, static)
+        gradient = _gradient(differentiable, perturbed, values, bar)
+        found = structure.flatten_up_to(gradient)
+        return [bar for bar, dx in zip(found, given, strict=True) if dx is not None]
+
+    like = eqx.filter(values[1:], eqx.is_inexact_array)
+    along = apply_linear(forward, transpose, like, arrays, [dx for dx in given if dx is not None])
+    return jtu.tree_map(lambda _: None, values[0]), *along
 
 
-@_solve.def_bwd
-def _backward(residuals, cotangents, perturbed, differentiable, record, remembers):
+def _gradient(differentiable, perturbed, values, bars):
+    _, handed_out, (record, final_state) = values
+    given, beside = bars
     if record is None:
         raise RuntimeError(_UNBOUNDED)
-    record, last, counts, handed_out = residuals
-    replay, start, (t0, t1, ts), forward = differentiable
-    _, given = cotangents
+    if jtu.tree_leaves(beside):
+        raise RuntimeError(_TWICE_BACKWARDS)
+    replay, start, (t0, t1, ts), run = differentiable
+    counts = [(s.ts, s.saveat_ts_index) for s in save_states(final_state)]
+    end = Progress.of(final_state)
     bar = jtu.tree_map(
         lambda x, b: jnp.zeros_like(x) if b is None else b,
         eqx.filter(handed_out, eqx.is_inexact_array),
         given,
     )
-    ends = Ends(t0, t1, *last)
+    ends = Ends(t0, t1, end.tprev, end.num_steps, end.num_accepted_steps, end.y)
     functions = Functions(*eqx.partition(replay, perturbed[0]))
     back = Backwards(
         functions,
@@ -218,7 +234,7 @@ def _backward(residuals, cotangents, perturbed, differentiable, record, remember
     if gradient.times is not None and bar.dense_ts is not None:
         at = lambda t: jnp.sum(jnp.where(handed_out.dense_ts == t, bar.dense_ts, 0))
         times = times._replace(t0=times.t0 + at(t0), t1=times.t1 + at(t1))
-    return gradient.leaves, gradient.state, tuple(times), eqx.filter(forward, lambda leaf: False)
+    return gradient.leaves, gradient.state, tuple(times), eqx.filter(run, lambda leaf: False)
 
 
 def _rows(replay: Replay, counts: list[Any], bar: HandedOut, ends: Ends) -> list[Rows]:
