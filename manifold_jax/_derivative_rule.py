@@ -85,13 +85,18 @@ def _shapes(*primals: Any, call_jaxpr: Any, rule: Callable) -> tuple[list, Any]:
 
 
 def _differentiate(primals: Any, tangents: Any, *, call_jaxpr: Any, rule: Callable) -> tuple:
-    primals = [jnp.asarray(x, x.dtype) for x in primals]  # literals of a traced function
+    primals = [_as_array(x) for x in primals]
     values = _ruled.bind(*primals, call_jaxpr=call_jaxpr, rule=rule)
     given = [_none_if_zero(x, dx) for x, dx in zip(primals, tangents, strict=True)]
     found = rule(values, primals, given)
     zero = lambda x: ad.Zero(jax.typeof(x).to_tangent_aval())
     along = [zero(x) if dx is None else dx for x, dx in zip(values, found, strict=True)]
     return values, along
+
+
+def _as_array(x: Any) -> Any:
+    """Also of the literals of a traced function, which may be numbers."""
+    return jnp.asarray(x, getattr(x, "dtype", None))
 
 
 def _none_if_zero(x: Any, dx: Any) -> Any:
@@ -161,7 +166,7 @@ def _shapes_of_linear(*operands: Any, avals: tuple, **_: Any) -> tuple:
 
 def _differentiate_linear(operands: Any, along: Any, **params: Any) -> tuple:
     k, forward = params["num_primals"], params["forward"]
-    operands = [jnp.asarray(x, x.dtype) for x in operands]
+    operands = [_as_array(x) for x in operands]
     primals, tangents = operands[:k], operands[k:]
     out = _linear.bind(*operands, **params)
     given = [ad.instantiate_zeros(dx) for dx in along]

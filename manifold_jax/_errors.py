@@ -14,7 +14,7 @@ Function = TypeVar("Function", bound=Callable)
 
 def clear_errors(function: Function) -> Function:
     """Around a function made by `equinox.filter_jit`: the message of an error comes last, where it
-    is looked for, a call with the wrong arguments is told the right ones, and one that is
+    is looked for, a call with the wrong arguments is told the right ones, and an ensemble that is
     differentiated forwards what to write for that."""
     signature, name = inspect.signature(function), getattr(function, "__name__", "")
 
@@ -35,7 +35,7 @@ def clear_errors(function: Function) -> Function:
 
 
 _FORWARDS = (
-    "The default `adjoint` has derivatives in reverse mode (`jax.grad`, `jax.vjp`, `jax.jacrev`). For forward mode "
+    "The default `adjoint` of ensembles has derivatives in reverse mode (`jax.grad`, `jax.vjp`, `jax.jacrev`). For forward mode "
     "(`jax.jvp`, `jax.jacfwd`, `jax.linearize`) pass `adjoint=diffrax.ForwardMode()`."
 )
 

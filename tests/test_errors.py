@@ -35,11 +35,12 @@ def test_errors_of_users_keep_the_place_where_they_occurred():
         mj.project(mj.Constraint(residual), 0.0, START, jnp.asarray(-1.0))
 
 
-def test_forward_mode_through_the_default_adjoint():
+def test_forward_mode_through_the_default_adjoint_of_ensembles():
     def end(y0):
         terms = dfx.ODETerm(lambda t, y, args: jnp.stack([-y[1], y[0]]))
         circle = mj.Constraint(lambda t, y, args: y @ y - 1.0)
-        return mj.diffeqsolve(terms, mj.Projected(dfx.Euler(), circle), 0.0, 0.1, 0.1, y0).ys
+        hook = mj.Projected(dfx.Euler(), circle)
+        return mj.solve_ensemble(terms, hook, 0.0, 0.1, 0.1, y0[None]).ys
 
     for transform in (jax.jacfwd, lambda f: jax.jit(jax.jacfwd(f))):
         with pytest.raises(TypeError, match=r"adjoint=diffrax.ForwardMode\(\)"):

@@ -1,4 +1,4 @@
-"""Reverse mode that goes back through the recorded steps, each computed once more."""
+"""The derivative of the steps that were made: backwards through their record, or forwards with them."""
 
 from typing import Any
 
@@ -27,7 +27,7 @@ from .sizes_held_fixed import SizesHeldFixed, with_end_held_fixed
 
 
 class StepReplayAdjoint(dfx.AbstractAdjoint):
-    r"""The derivative of the discrete solution in reverse mode; the default of
+    r"""The derivative of the discrete solution, in reverse and in forward mode; the default of
     [`diffeqsolve`][].
 
     From the accepted steps $y_{i+1} = \Phi(t_i, t_{i+1}, y_i, \theta)$ and the gradient
@@ -42,6 +42,10 @@ class StepReplayAdjoint(dfx.AbstractAdjoint):
     controller instead: rounded differently, repeated steps get other sizes, and its gradient is
     that of another solution. At tight tolerances it is less accurate than the solve, and with
     additive methods (`KenCarp3` and a `MultiTerm`) it can be plainly wrong.
+
+    Forward mode differentiates the solve itself with the ends of its steps held fixed, so that both
+    modes give the same numbers. (It still makes the record: where only forward mode is needed,
+    `diffrax.ForwardMode()` takes less memory.)
 
     Derivatives are those with respect to `y0`, `args`, all that terms, constraints and `fn` hold or
     close over, `t0`, `t1` and `SaveAt(ts=...)`. Under `vmap` all trajectories go back with one
@@ -59,9 +63,9 @@ class StepReplayAdjoint(dfx.AbstractAdjoint):
 
     `ValueError` for an `UnsafeBrownianPath`. `RuntimeError` when differentiating with
     `max_steps=None`, as there is no room for the record, or with respect to `dt0`, on which a
-    solution depends by its error alone. It cannot be differentiated forwards (its gradient can,
-    for Hessian-vector products): for that, and for few parameters and many outputs, use
-    `diffrax.ForwardMode()`. With thousands of parameters in common under `vmap` (neural networks)
+    solution depends by its error alone. Both modes can be differentiated forwards once more
+    (Hessian-vector products), but not in reverse mode: for that use `diffrax.DirectAdjoint()`.
+    With thousands of parameters in common under `vmap` (neural networks)
     each trajectory sums up a gradient of its own.
 
     Source: Griewank & Walther, Evaluating Derivatives (2008), ch. 12, without recursion.

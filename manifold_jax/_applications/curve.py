@@ -101,8 +101,7 @@ def trace_curve(
     - `max_steps`: the most steps.
     - `parameter`: the component whose turning points are reported.
     - `max_turning_points`: room for them.
-    - `adjoint`: how to differentiate, by default in reverse mode by
-        [`StepReplayAdjoint`][]. Pass `diffrax.ForwardMode()` for forward mode.
+    - `adjoint`: how to differentiate, by default in both modes by [`StepReplayAdjoint`][].
     - `throw`: raise where the trace fails. Otherwise look at `result`.
 
     **Returns:**

@@ -62,9 +62,8 @@ def diffeqsolve(
         algebraic equations of a [`MassMatrixTerm`][], which is checked to half of the digits.
     - `event`: event functions get the true time, also when integrating backwards. With a root
         finder the earliest event ends the solve, whatever the order of `cond_fn`.
-    - `adjoint`: how derivatives are computed, by default in reverse mode by
-        [`StepReplayAdjoint`][], from the very steps that were made. For forward mode pass
-        `diffrax.ForwardMode()`. Diffrax's other adjoints compute steps again, which round
+    - `adjoint`: how derivatives are computed, by default in both modes by
+        [`StepReplayAdjoint`][], from the very steps that were made. Diffrax's other adjoints compute steps again, which round
         differently and get other sizes: where tolerances are tight their gradients are less
         accurate than the solution.
 

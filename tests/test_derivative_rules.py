@@ -1,0 +1,289 @@
+"""Every derivative rule of the library's own, differentiated once and twice, in all orders of modes,
+alone, compiled, inside of loops and in batches, next to finite differences."""
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+import pytest
+
+import manifold_jax as mj
+from manifold_jax._applications.following import kernel
+from manifold_jax._closure import convert_closure
+from manifold_jax._dae.pivots import Pivoted
+from manifold_jax._derivative_rule import ForwardRule
+from manifold_jax._linear import Elimination, factorize, factorize_once, pseudo_invert
+from manifold_jax._newton import root_of_step
+from manifold_jax._rosenbrock.elimination import factorize_pivoted
+from manifold_jax._solver.explicit import derivative_once
+
+
+def matrix(a, n):
+    """Symmetric and positive definite."""
+    x = jnp.arange(n * n, dtype=float).reshape(n, n)
+    A = jnp.sin(x * a) + 0.3 * x / n**2
+    return A @ A.T / n + jnp.eye(n) * (1 + a**2)
+
+
+def vector(a, n):
+    return jnp.cos(a * jnp.arange(1.0, n + 1))
+
+
+def total(x):
+    return jnp.sum(x * jnp.sin(jnp.arange(1.0, x.size + 1)))
+
+
+def solved(factorized, n):
+    return lambda a: total(factorized(matrix(a, n)).solve(vector(a, n)))
+
+
+def pseudo_inverse(a):
+    """Of the third equation twice."""
+    A = matrix(a, 3)
+    rows = jnp.array([0, 1, 2, 2])
+    return total(pseudo_invert(A[rows][:, rows], equilibrated=True).solve(vector(a, 3)[rows]))
+
+
+def cube_root(a):
+    step = convert_closure(lambda x: -(x**3 - a) / (3 * x**2), a)
+    return root_of_step(step, jax.lax.stop_gradient(a) ** (1 / 3)) ** 2
+
+
+def planar(t, q, a):
+    return q @ q - a["length"] ** 2
+
+
+def pushed(t, q, v, a):
+    return jnp.stack([0.3 * a["push"] * q[1], -a["gravity"] - 0.1 * v[1] ** 2])
+
+
+PARAMETERS = {"length": 1.0, "gravity": 9.81, "push": 0.5, "mass": 1.3}
+STATE = jnp.array([0.6, -0.8]), jnp.array([0.8, 0.6])
+SYSTEM = mj.MechanicalSystem(lambda q, a: a["mass"] * (1 + q[0] ** 2), planar, pushed)
+TWICE = lambda t, y, a: jnp.stack([y @ y - a, 2 * (y @ y) - 2 * a])
+
+
+def with_all(a):
+    return {
+        name: value * (1 + (a - 1) / (k + 1)) for k, (name, value) in enumerate(PARAMETERS.items())
+    }
+
+
+def swinging(t, x, xdot, a):
+    q, v, force = x["q"], x["v"], x["force"]
+    pull = -force * q - jnp.stack([0 * a, 9.81 * a])
+    return xdot["q"] - v, xdot["v"] - pull, q @ q - 1
+
+
+GUESS = {"q": STATE[0], "v": STATE[1], "force": jnp.asarray(1.0)}
+DAE = mj.reduce_dae(swinging, GUESS, jnp.asarray(1.0))
+DAE1 = mj.reduce_dae(swinging, GUESS, jnp.asarray(1.0), form="index-1")
+Z = jnp.array([0.6, -0.8, 0.8, 0.6])
+MASS_TERM = mj.MassMatrixTerm(
+    lambda t, y, a: jnp.stack([-a * y[1] * y[0], y[1] ** 3 - a * y[0] - 1]), jnp.array([1.0, 0.0])
+)
+
+
+def corrected(constraint, y, far):
+    correct = mj.consistent_state if far else mj.project
+    return lambda a: total(jax.tree.leaves(correct(constraint, 0.0, y, a)[0])[0])
+
+
+CURVED = mj.Constraint(lambda t, y, a: jnp.stack([y @ y - a, y[0] * y[1] * a - 0.3]))
+POINT = jnp.array([0.7, 0.5, 0.6])
+
+
+RULES = {
+    "elimination without exchanges": solved(factorize, 3),
+    "of the library": solved(factorize, 10),
+    "inverse": solved(factorize_once, 4),
+    "elimination with exchanges": solved(Elimination, 4),
+    "pivoted, few": solved(Pivoted.of, 3),
+    "pivoted, many": solved(Pivoted.of, 10),
+    "stages of Rosenbrock methods": solved(factorize_pivoted, 3),
+    "pseudo-inverse": pseudo_inverse,
+    "derivative_once": lambda a: total(derivative_once(vector(a, 3) ** 2, vector(a, 3))),
+    "root of a step": cube_root,
+    "tangent of a curve": lambda a: total(kernel(matrix(a, 3)[:2])),
+    "correction": corrected(CURVED, POINT, False),
+    "consistent state": corrected(CURVED, POINT, True),
+    "redundant correction": corrected(mj.Constraint(TWICE, redundant=True), POINT, False),
+    "mechanical correction": lambda a: corrected(SYSTEM.constraint, STATE, True)(with_all(a)),
+    "accelerations": lambda a: total(SYSTEM.accelerations(0.0, STATE, with_all(a))),
+    "reduced DAE": lambda a: total(DAE.terms.vf(0.0, a * Z, a)),
+    "start of a reduced DAE": lambda a: total(
+        DAE.consistent_state(0.0, {**GUESS, "q": GUESS["q"] * a}, a)[0]
+    ),
+    "start of index 1": lambda a: total(DAE1.consistent_state(0.0, GUESS, a)[0]),
+    "start with a mass matrix": lambda a: total(
+        MASS_TERM.consistent_state(0.0, jnp.array([1.0, 1.2]), a)[0]
+    ),
+}
+
+
+def alone(f):
+    return f
+
+
+def in_scan(f):
+    step = lambda c, _: (c + 0.1 * jnp.tanh(f(c)), None)
+    return lambda a: jax.lax.scan(step, a, None, length=2)[0]
+
+
+def in_batch(f):
+    return lambda a: jnp.sum(jax.vmap(f)(jnp.stack([a, 1.01 * a])))
+
+
+def in_while_loop(f):
+    """Which has forward mode alone."""
+    step = lambda c: (c[0] + 1, c[1] + 0.1 * jnp.tanh(f(c[1])))
+    return lambda a: jax.lax.while_loop(lambda c: c[0] < 2, step, (0, a))[1]
+
+
+def forwards(f):
+    return lambda a: jax.jvp(f, (a,), (jnp.ones_like(a),))[1]
+
+
+def check(f, at, compiled=True, reverse=True):
+    """First and second derivatives in every order of modes against differences of sixth order."""
+    run = jax.jit if compiled else lambda f: f
+    first = {"forward": forwards(f)} | ({"reverse": jax.grad(f)} if reverse else {})
+    second = {"forward, forward": forwards(forwards(f))}
+    if reverse:
+        second |= {
+            "forward, reverse": forwards(jax.grad(f)),
+            "reverse, forward": jax.grad(forwards(f)),
+            "reverse, reverse": jax.grad(jax.grad(f)),
+        }
+    slope, bend = differences(run(f), at), differences(run(first["forward"]), at)
+    for name, derivative in first.items():
+        np.testing.assert_allclose(run(derivative)(at), slope, rtol=1e-8, atol=1e-9, err_msg=name)
+    for name, derivative in second.items():
+        np.testing.assert_allclose(run(derivative)(at), bend, rtol=1e-7, atol=1e-8, err_msg=name)
+    assert abs(slope) > 1e-3
+    return abs(bend)
+
+
+def differences(f, at, h=2e-3):
+    weights = {1: 3 / 4, 2: -3 / 20, 3: 1 / 60}
+    return sum(w * (f(at + k * h) - f(at - k * h)) for k, w in weights.items()) / h
+
+
+WHERE = {"alone": alone, "in scan": in_scan, "in a batch": in_batch}
+AT = jnp.asarray(1.05)
+
+
+@pytest.mark.parametrize("where", WHERE)
+@pytest.mark.parametrize("rule", RULES)
+def test_every_rule(rule, where):
+    assert check(WHERE[where](RULES[rule]), AT) > 1e-4
+
+
+@pytest.mark.parametrize("rule", RULES)
+def test_every_rule_in_a_while_loop(rule):
+    check(in_while_loop(RULES[rule]), AT, reverse=False)
+
+
+@pytest.mark.parametrize("rule", ["root of a step", "inverse", "reduced DAE", "pseudo-inverse"])
+def test_rules_that_are_not_compiled(rule):
+    check(RULES[rule], AT, compiled=False)
+
+
+def test_a_rule_is_kept_in_loops():
+    """What `jax.custom_jvp` loses: a function whose derivative is not that of its operations."""
+
+    @ForwardRule
+    def function(x):
+        return jax.lax.stop_gradient(x) ** 3
+
+    @function.define_jvp
+    def rule(value, primals, tangents):
+        del value
+        return 3 * primals[0] ** 2 * tangents[0]
+
+    check(in_scan(function), jnp.asarray(0.7))
+    batched = jax.vmap(jax.grad(in_scan(function)))(jnp.array([0.7, 0.8]))
+    np.testing.assert_allclose(batched[0], jax.grad(in_scan(function))(0.7), rtol=1e-14)
+
+
+def rigid(t, y, a):
+    return jnp.stack([a * y[1] * y[2], -1.1 * y[0] * y[2], (1.1 - a) * y[0] * y[1]])
+
+
+SPHERE = mj.Constraint(lambda t, y, a: y @ y - (1 + 0.1 * jnp.sin(a)))
+ROD = mj.MechanicalSystem(1.0, lambda t, q, a: q @ q - a, lambda t, q, v, a: jnp.stack([0 * a, -a]))
+SOLVES = {
+    "projected": (
+        dfx.ODETerm(rigid),
+        mj.Projected(dfx.Tsit5(), SPHERE),
+        jnp.array([0.9, 0.5, 0.1]),
+    ),
+    "mechanism": (ROD.terms, mj.Projected(dfx.Heun(), ROD.constraint), STATE),
+    "reduced": (DAE.terms, mj.Projected(dfx.Tsit5(), DAE.constraint), Z),
+    "reduced, alone": (DAE.terms, dfx.Tsit5(), Z),
+    "implicit": (
+        dfx.ODETerm(rigid),
+        mj.Projected(dfx.Kvaerno3(), SPHERE),
+        jnp.array([0.9, 0.5, 0.1]),
+    ),
+    "index 1": (MASS_TERM, mj.Rodas5P(), jnp.array([1.0, 1.2])),
+}
+
+
+def end_of(name, adjoint=None):
+    terms, solver, y0 = SOLVES[name]
+    tight = dict(rtol=1e-10, atol=1e-10, norm=optx.max_norm)
+    if name == "implicit":
+        stages = dfx.VeryChord(**tight)
+        solver = eqx.tree_at(lambda s: s.inner.root_finder, solver, stages)
+
+    def end(a):
+        start = jax.tree.map(lambda leaf: leaf * (1 + 0.1 * (a - 1)), y0)
+        saveat = dfx.SaveAt(ts=jnp.array([0.13, 0.3]))
+        options = dict(adjoint=adjoint) if adjoint is not None else {}
+        sol = mj.diffeqsolve(terms, solver, 0.0, 0.3, 0.1, start, a, saveat=saveat, **options)
+        return total(jax.tree.leaves(sol.ys)[0].reshape(-1))
+
+    return end
+
+
+@pytest.mark.parametrize("name", SOLVES)
+def test_solves(name):
+    """Both modes of the default adjoint, and forward mode of both."""
+    end = end_of(name)
+    slope, bend = differences(jax.jit(end), AT), differences(jax.jit(jax.grad(end)), AT)
+    for derivative in (jax.grad(end), forwards(end)):
+        np.testing.assert_allclose(jax.jit(derivative)(AT), slope, rtol=1e-8)
+    for derivative in (forwards(jax.grad(end)), forwards(forwards(end))):
+        np.testing.assert_allclose(jax.jit(derivative)(AT), bend, rtol=1e-7, atol=1e-9)
+
+
+def test_reverse_over_reverse_of_a_solve():
+    """With outputs between the steps."""
+    end = end_of("projected", dfx.DirectAdjoint())
+    bend = differences(jax.jit(jax.grad(end)), AT)
+    np.testing.assert_allclose(jax.jit(jax.grad(jax.grad(end)))(AT), bend, rtol=1e-8)
+
+
+def test_a_boundary_value_by_optimistix():
+    """Newton's method asks for forward mode, the derivative of its root for both."""
+    end = end_of("projected")
+    goal = end(AT)
+
+    def found(x):
+        newton = optx.Newton(rtol=1e-12, atol=1e-12)
+        return optx.root_find(lambda a, x: end(a) - x, newton, AT + 0.05, x).value
+
+    np.testing.assert_allclose(jax.jit(found)(goal), AT, rtol=1e-10)
+    slope = 1 / jax.grad(end)(AT)
+    np.testing.assert_allclose(jax.jit(jax.grad(found))(goal), slope, rtol=1e-9)
+    np.testing.assert_allclose(jax.jit(forwards(found))(goal), slope, rtol=1e-9)
+
+
+def test_the_loop_of_a_user():
+    """Euler's method in a scan, of which JAX's own rules lose the second derivative altogether."""
+    step = lambda z, a: z + 0.02 * DAE.terms.vf(0.0, z, a)
+    end = lambda a: jax.lax.scan(lambda z, _: (step(z, a), None), Z, None, length=5)[0][2]
+    assert check(end, AT) > 1e-6
