@@ -205,7 +205,7 @@ def _pseudo_inverse(A: Float[Array, "m m"], dependent: FloatScalar) -> Float[Arr
     where `rtol` is an array.)"""
     values, V = jnp.linalg.eigh(A, symmetrize_input=False)
     used = jnp.abs(values) > dependent * jnp.max(jnp.abs(values))
-    return (V * jnp.where(used, 1 / jnp.where(used, values, 1), 0)) @ V.T
+    return (V * jnp.where(used, 1 / jnp.where(used, values, 1), 0)[None, :]) @ V.T
 
 
 @_pseudo_inverse.define_jvp
