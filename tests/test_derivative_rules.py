@@ -171,7 +171,7 @@ def check(f, at, compiled=True, reverse=True):
         np.testing.assert_allclose(run(derivative)(at), slope, rtol=1e-8, atol=1e-9, err_msg=name)
     for name, derivative in second.items():
         np.testing.assert_allclose(run(derivative)(at), bend, rtol=1e-7, atol=1e-8, err_msg=name)
-    assert abs(slope) > 1e-3
+    assert abs(slope) > 1e-5
     return abs(bend)
 
 
@@ -187,7 +187,7 @@ AT = jnp.asarray(1.05)
 @pytest.mark.parametrize("where", variants(WHERE, ["in scan"]))
 @pytest.mark.parametrize("rule", RULES)
 def test_every_rule(rule, where):
-    assert check(WHERE[where](RULES[rule]), AT) > 1e-4
+    assert check(WHERE[where](RULES[rule]), AT) > 1e-6
 
 
 @pytest.mark.slow

@@ -39,7 +39,7 @@ def test_forward_mode_through_the_default_adjoint_of_ensembles():
     def end(y0):
         terms = dfx.ODETerm(lambda t, y, args: jnp.stack([-y[1], y[0]]))
         circle = mj.Constraint(lambda t, y, args: y @ y - 1.0)
-        hook = mj.Projected(dfx.Euler(), circle)
+        hook = mj.Projected(dfx.Tsit5(), circle)
         return mj.solve_ensemble(terms, hook, 0.0, 0.1, 0.1, y0[None]).ys
 
     for transform in (jax.jacfwd, lambda f: jax.jit(jax.jacfwd(f))):

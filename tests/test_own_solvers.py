@@ -133,3 +133,36 @@ class OwnEuler(dfx.AbstractERK):
 def test_one_stage():
     y = START + 0.1 * 2.0 * np.array([-START[1], START[0]])
     np.testing.assert_allclose(one_step(OwnEuler()).ys[0], to_circle(y), atol=1e-15)
+
+
+class OwnHook(dfx.AbstractWrappedSolver):
+    """A step hook that is none of the library's."""
+
+    solver: dfx.AbstractSolver
+    term_structure = dfx.Tsit5.term_structure
+    interpolation_cls = dfx.Tsit5.interpolation_cls
+
+    def order(self, terms):
+        return self.solver.order(terms)
+
+    def init(self, *args):
+        return self.solver.init(*args)
+
+    def func(self, *args):
+        return self.solver.func(*args)
+
+    def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
+        y1, *rest = self.solver.step(terms, t0, t1, y0, args, solver_state, made_jump)
+        return y1 / jnp.sqrt(y1 @ y1), *rest
+
+
+def test_a_hook_of_the_users_own():
+    """The library does not know its constraint, and says so; inside of `Projected` all is corrected."""
+    off = START + 0.2
+    solve = lambda solver: mj.diffeqsolve(
+        TURN, solver, 0.0, 1.0, 0.2, off, 1.0, saveat=dfx.SaveAt(t0=True, ts=jnp.array([0.5, 0.7]))
+    )
+    with pytest.warns(UserWarning, match=r"`mj.Projected\(OwnHook\(...\), constraint\)`"):
+        assert abs(solve(OwnHook(dfx.Tsit5())).ys[0] @ off - off @ off) < 1e-12
+    ys = solve(mj.Projected(OwnHook(dfx.Tsit5()), CIRCLE)).ys
+    np.testing.assert_allclose(jnp.sum(ys**2, axis=1), 1.0, atol=1e-15)

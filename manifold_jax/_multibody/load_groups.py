@@ -64,7 +64,7 @@ def _laws(things: list[Any], names: list[str], rest: str) -> SpringLaws:
     values = tuple(
         check_value("value", law.value, name, ()) for law, name in zip(laws, names, strict=True)
     )
-    driven = any(callable(v) or not is_concrete(v) or np.any(v) for v in values)
+    driven = any(callable(v) or not is_concrete(v) or np.any(np.asarray(v)) for v in values)
     columns = (stack(column) for column in zip(*numbers, strict=True))
     return SpringLaws(tuple(names), *columns, values if driven else None)  # pyright: ignore[reportCallIssue]
 

@@ -1,5 +1,6 @@
 """A solver alone: one of Diffrax for comparisons, or a Rosenbrock method."""
 
+import warnings
 from typing import Any
 
 import diffrax as dfx
@@ -32,6 +33,7 @@ def solve_without_hook(
 ) -> dfx.Solution:
     """What Diffrax returns, except that implicit stages are accurate, a state that is not finite is
     no success, and Rosenbrock methods get a consistent start and a first step."""
+    _warn_of_unknown_hook(solver)
     solver, moved = with_accurate_stages(solver), None
     if isinstance(solver, AbstractRosenbrock):
         dtype = time_dtype(t0, t1, dt0, saveat)
@@ -60,3 +62,15 @@ def solve_without_hook(
     if moved is not None:
         sol = eqx.tree_at(lambda s: s.stats, sol, {**sol.stats, "initial_correction": moved})
     return raise_if_failed(sol, ~is_okay(result), solver) if throw else sol
+
+
+def _warn_of_unknown_hook(solver: dfx.AbstractSolver) -> None:
+    if isinstance(solver, dfx.HalfSolver) or not isinstance(solver, dfx.AbstractWrappedSolver):
+        return
+    name = type(solver).__name__
+    warnings.warn(
+        f"`solver` is a {name}, a wrapper of your own: `mj.diffeqsolve` does not know its constraint, and corrects "
+        "neither `y0` nor values between steps (`SaveAt(ts=)`, events, the dense solution). Write "
+        f"`mj.Projected({name}(...), constraint)`, or call `diffrax.diffeqsolve`.",
+        stacklevel=2,
+    )
