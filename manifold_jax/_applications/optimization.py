@@ -17,6 +17,7 @@ from .._constraint import AbstractConstraint, Constraint
 from .._constraint_checks import check_constraint, check_state
 from .._custom_types import Args, BoolScalar, FloatScalar, RealScalarLike, Y
 from .._errors import clear_errors
+from .._numbers import numbers_as_arrays
 from .._newton import without_derivative
 from .._projection import NewtonProjection
 from .._residual import residual_vector, row_scale
@@ -76,6 +77,7 @@ class ConstrainedMinimum(eqx.Module):
 
 
 @clear_errors
+@numbers_as_arrays("x0", "args", times=("t1",))
 @eqx.filter_jit
 def gradient_flow(
     objective: Callable[[Y, Args], FloatScalar],

@@ -14,8 +14,10 @@ from jaxtyping import Array
 from .._adjoint import StepReplayAdjoint
 from .._custom_types import Args, RealScalarLike, Y
 from .._errors import clear_errors
+from .._numbers import numbers_as_arrays
 from .._solve.arguments import check_arguments
 from .._solve.start import Consistent
+from .._solve.times import checking_first_step
 from .arguments import Batch, checked_batch, checked_step, checked_times
 from .axes import anywhere, Axes, largest
 from .devices import check_mesh, over_devices
@@ -26,6 +28,8 @@ from .trajectory import Equations
 
 
 @clear_errors
+@checking_first_step
+@numbers_as_arrays("y0s", "args", times=("t0", "t1", "dt0"))
 @eqx.filter_jit
 def solve_ensemble(
     terms: dfx.AbstractTerm,

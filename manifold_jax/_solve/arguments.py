@@ -58,11 +58,6 @@ def check_arguments(
             "`dt0` is None, but the size of the steps is constant: give it, or let "
             "`stepsize_controller=diffrax.PIDController(rtol=1e-6, atol=1e-6)` choose."
         )
-    if isinstance(dt0, int | float) and not abs(dt0) > 0:
-        raise ValueError(
-            f"`dt0` must be the length of the first step, with the sign of t1 - t0, got {dt0}. With an adaptive "
-            "`stepsize_controller` it may be None."
-        )
     _check_choices(adjoint, consistent)
 
 

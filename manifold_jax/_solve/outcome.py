@@ -32,6 +32,9 @@ _NOT_FINITE = (
     "The state is not finite (NaN or infinite) from some time on: the vector field is not defined on the way. For an "
     "`mj.MechanicalSystem` the mass matrix is not positive definite there, or constraints depend on each other."
 )
+_NO_TIME = (
+    "`t0` or `t1` is NaN, or another of the times (`dt0`, `SaveAt(ts=...)`) is no number: nothing was solved."
+)
 _SINGULAR = (
     "A step could not be made: `y0` does not satisfy the algebraic equations (see "
     "`mj.MassMatrixTerm.consistent_state`), or the matrix M - h gamma df/dy is singular or not finite, as where the index "
@@ -74,6 +77,7 @@ def messages_for(solver: dfx.AbstractSolver) -> list[str]:
     """What the result codes of a solve mean, by number, instead of what Diffrax says."""
     messages = messages_of_results()
     texts = [(RESULTS.max_steps_reached, _TOO_MANY), (RESULTS.nonfinite, _NOT_FINITE)]
+    texts.append((RESULTS.nonfinite_input, _NO_TIME))
     if isinstance(solver, AbstractManifoldSolver):
         text = _NOT_CORRECTED if solver.corrects_output else _TOO_LONG
         texts.append((nonlinear_failure(), text))
