@@ -2,9 +2,10 @@
 
 import functools
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from typing import Any, cast, TypeVar
 
+import equinox as eqx
 import jax
 import jax.core
 import jax.numpy as jnp
@@ -25,7 +26,7 @@ def numbers_as_arrays(*names: str, times: tuple[str, ...] = ()) -> Callable[[Fun
         def converted(name: str, value: Any) -> Any:
             if name in times:
                 return _time_as_array(value)
-            return with_arrays(value) if name in names else value
+            return with_arrays(_checked(name, value)) if name in names else value
 
         @functools.wraps(function)
         def call(*args: Any, **kwargs: Any) -> Any:
@@ -36,6 +37,19 @@ def numbers_as_arrays(*names: str, times: tuple[str, ...] = ()) -> Callable[[Fun
         return cast(Function, call)
 
     return decorate
+
+
+def _checked(name: str, tree: Any) -> Any:
+    """Refuse objects that JAX can neither look into nor compare with those of another call."""
+    for leaf in jtu.tree_leaves(tree):
+        if eqx.is_array_like(leaf) or isinstance(leaf, Hashable):
+            continue
+        kind = type(leaf).__name__
+        raise TypeError(
+            f"`{name}` has a {kind}, into which JAX cannot look. Make {kind} an `equinox.Module` or a `typing.NamedTuple`, "
+            f"or register it: `@jax.tree_util.register_dataclass` above `@dataclasses.dataclass`."
+        )
+    return tree
 
 
 def with_arrays(tree: Any) -> Any:

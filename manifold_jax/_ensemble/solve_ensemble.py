@@ -15,7 +15,7 @@ from .._adjoint import StepReplayAdjoint
 from .._custom_types import Args, RealScalarLike, Y
 from .._errors import clear_errors
 from .._numbers import numbers_as_arrays
-from .._solve.arguments import check_arguments
+from .._solve.arguments import check_arguments, fault_of_field
 from .._solve.start import Consistent
 from .._solve.times import checking_first_step
 from .arguments import Batch, checked_batch, checked_step, checked_times
@@ -113,6 +113,9 @@ def solve_ensemble(
         try:
             solution = solve_on_one_device(inputs, lanes)
         except Exception as error:
+            one = jax.eval_shape(batch.one)
+            if fault := fault_of_field(equations.terms, one.t0, one.y0, one.args):
+                raise ValueError(fault) from error
             error.add_note(_example(inputs[1]))
             raise
         solution = dataclasses.replace(solution, messages=messages_of(solver))

@@ -1,6 +1,9 @@
 """Arguments of `mj.diffeqsolve` that cannot work, refused with what to write instead."""
 
-from typing import Any
+import functools
+import inspect
+from collections.abc import Callable
+from typing import Any, cast, TypeVar
 
 import diffrax as dfx
 import equinox as eqx
@@ -8,12 +11,14 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 
 from .._compat import save_y
-from .._custom_types import RealScalarLike, Y
+from .._custom_types import Args, RealScalarLike, Y
 from .._directed_term import DirectedTerm
 from .._solver import Stabilized
 from .._stability import is_stable, stability_interval
 from .._user_function import check_function
 
+
+Function = TypeVar("Function", bound=Callable)
 
 # What Diffrax passes to an event function by name.
 _EVENT_KEYWORDS = ("terms", "solver", "t0", "t1", "dt0", "saveat", "stepsize_controller")
@@ -59,6 +64,51 @@ def check_arguments(
             "`stepsize_controller=diffrax.PIDController(rtol=1e-6, atol=1e-6)` choose."
         )
     _check_choices(adjoint, consistent)
+
+
+def check_max_steps(max_steps: Any) -> None:
+    if max_steps is None or (isinstance(max_steps, int) and max_steps > 0):
+        return
+    raise ValueError(
+        f"`max_steps` must be a positive integer, or None for no bound, got {max_steps!r}."
+    )
+
+
+def explained(function: Function) -> Function:
+    """Around a solve: of an error in it that comes from a vector field unlike the state, say so."""
+    signature = inspect.signature(function)
+
+    @functools.wraps(function)
+    def solve(*args: Any, **kwargs: Any) -> Any:
+        __tracebackhide__ = True
+        try:
+            return function(*args, **kwargs)
+        except (TypeError, ValueError) as error:
+            given = signature.bind(*args, **kwargs).arguments
+            fault = fault_of_field(*(given.get(name) for name in ("terms", "t0", "y0", "args")))
+            if fault is None:
+                raise
+            raise ValueError(fault) from error
+
+    return cast(Function, solve)
+
+
+def fault_of_field(terms: Any, t0: Any, y0: Any, args: Any) -> str | None:
+    """What to say of a vector field of another shape than the state."""
+    if not isinstance(terms, dfx.ODETerm):
+        return None
+    try:
+        field = eqx.filter_eval_shape(terms.vector_field, t0, y0, args)
+    except Exception:  # which is the error itself
+        return None
+    shapes = [[jnp.shape(leaf) for leaf in jtu.tree_leaves(tree)] for tree in (field, y0)]
+    if jtu.tree_structure(field) != jtu.tree_structure(y0) or shapes[0] == shapes[1]:
+        return None  # Diffrax speaks of other structures
+    got, state = (jtu.tree_map(jnp.shape, tree) for tree in (field, y0))
+    return (
+        f"The vector field in `terms` must be like the state, of shape {state}, but returns {got}: one velocity for "
+        "every number of `y`."
+    )
 
 
 def _check_choices(adjoint: Any, consistent: str) -> None:

@@ -11,7 +11,7 @@ from .._errors import clear_errors
 from .._numbers import numbers_as_arrays
 from .._of_args import evaluated
 from .._solver.base import AbstractManifoldSolver
-from .arguments import check_arguments, raise_if_unstable
+from .arguments import check_arguments, check_max_steps, explained, raise_if_unstable
 from .finish import finish
 from .mass_matrix import trusting
 from .output import events_in_true_time, on_manifold_saving
@@ -26,6 +26,7 @@ from .without_hook import solve_without_hook
 @numbers_as_arrays("y0", "args", times=("t0", "t1", "dt0"))
 @eqx.filter_jit
 @refusing_missing_times
+@explained
 def diffeqsolve(
     terms: Any,
     solver: dfx.AbstractSolver,
@@ -99,6 +100,7 @@ def diffeqsolve(
     Source: Sudarsan & Keerthi, Appl. Math. Comput. 92 (1998) 153-193.
     """
     check_arguments(terms, solver, dt0, saveat, stepsize_controller, adjoint, event, consistent)
+    check_max_steps(max_steps)
     adjoint = CheckedStartAdjoint(adjoint)
     if event is not None and event.root_finder is not None:
         adjoint = LocatingAdjoint(adjoint)
