@@ -35,7 +35,7 @@ class ReducedDAE(eqx.Module):
     def constraint(self) -> ReducedConstraint:
         """The manifold, for [`Projected`][], [`Stabilized`][] and [`LocalCoordinates`][]: what the
         equations and their derivatives say of the state. Without equations (`num_constraints` of
-        the report is 0) use the solver alone."""
+        the report is 0) `mj.diffeqsolve` uses the solver alone."""
         return ReducedConstraint(system=self.system)
 
     def consistent_state(

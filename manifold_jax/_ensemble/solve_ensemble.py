@@ -15,7 +15,12 @@ from .._adjoint import StepReplayAdjoint
 from .._custom_types import Args, RealScalarLike, Y
 from .._errors import clear_errors
 from .._numbers import numbers_as_arrays
-from .._solve.arguments import check_arguments, fault_of_field
+from .._solve.arguments import (
+    check_arguments,
+    fault_of_field,
+    warn_of_rounding,
+    without_idle_hook,
+)
 from .._solve.start import Consistent
 from .._solve.times import checking_first_step
 from .arguments import Batch, checked_batch, checked_step, checked_times
@@ -101,6 +106,9 @@ def solve_ensemble(
     batch = checked_batch(t0, t1, dt0, y0s, args, in_axes, saveat, lanes)
     if not isinstance(max_steps, int) or max_steps < 1:
         raise ValueError(f"`max_steps` must be a positive integer, got {max_steps!r}.")
+    one = jax.eval_shape(batch.one)
+    warn_of_rounding(one.y0, batch.dtype, stepsize_controller)
+    solver = without_idle_hook(solver, one.t0, one.y0, one.args)
     equations = Equations(
         terms, solver, stepsize_controller, saveat, dt0, adjoint, max_steps, consistent
     )
@@ -113,7 +121,6 @@ def solve_ensemble(
         try:
             solution = solve_on_one_device(inputs, lanes)
         except Exception as error:
-            one = jax.eval_shape(batch.one)
             if fault := fault_of_field(equations.terms, one.t0, one.y0, one.args):
                 raise ValueError(fault) from error
             error.add_note(_example(inputs[1]))

@@ -2,18 +2,22 @@
 
 import functools
 import inspect
+import warnings
 from collections.abc import Callable
 from typing import Any, cast, TypeVar
 
 import diffrax as dfx
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 
 from .._compat import save_y
+from .._constraint_checks import has_no_equations
 from .._custom_types import Args, RealScalarLike, Y
 from .._directed_term import DirectedTerm
 from .._solver import Stabilized
+from .._solver.base import AbstractManifoldSolver, controller_tolerances
 from .._stability import is_stable, stability_interval
 from .._user_function import check_function
 
@@ -151,6 +155,33 @@ def _check_kind(name: str, value: Any, kind: type, example: str) -> None:
         got = repr(value) if isinstance(value, str) else type(value).__name__
         raise TypeError(
             f"`{name}` must be a `diffrax.{kind.__name__}`, got {got}. Write e.g. `{example}`."
+        )
+
+
+def without_idle_hook(solver: Any, t0: RealScalarLike, y0: Y, args: Args) -> Any:
+    """The solver alone where its hook has no equations to keep, as systems that are reduced or
+    generated may have none."""
+    if not isinstance(solver, AbstractManifoldSolver):
+        return solver
+    return solver.inner if has_no_equations(solver.constraint, t0, y0, args) else solver
+
+
+def warn_of_rounding(y0: Y, time: Any, controller: Any) -> None:
+    """Tolerances that are known, and below what numbers of 32 bits can tell apart."""
+    tolerances = controller_tolerances(controller)
+    if tolerances is None or not all(
+        isinstance(x, int | float) for x in (tolerances.rtol, tolerances.atol)
+    ):
+        return
+    with jax.numpy_dtype_promotion("standard"):
+        dtype = jnp.result_type(time, *jtu.tree_leaves(y0))
+    largest = max(tolerances.rtol, tolerances.atol)
+    if jnp.issubdtype(dtype, jnp.floating) and largest < 5 * jnp.finfo(dtype).eps:
+        warnings.warn(
+            f"`rtol` and `atol` of `stepsize_controller` are at most {largest:g}, below the rounding of {dtype} numbers, "
+            f"{jnp.finfo(dtype).eps:.0e}: steps become tiny and gain nothing. Use tolerances from "
+            f'{10 * jnp.finfo(dtype).eps:.0e} on, or 64 bits (`jax.config.update("jax_enable_x64", True)`).',
+            stacklevel=2,
         )
 
 

@@ -11,11 +11,18 @@ from .._errors import clear_errors
 from .._numbers import numbers_as_arrays
 from .._of_args import evaluated
 from .._solver.base import AbstractManifoldSolver
-from .arguments import check_arguments, check_max_steps, explained, raise_if_unstable
+from .arguments import (
+    check_arguments,
+    check_max_steps,
+    explained,
+    raise_if_unstable,
+    warn_of_rounding,
+    without_idle_hook,
+)
 from .finish import finish
 from .mass_matrix import trusting
 from .output import events_in_true_time, on_manifold_saving
-from .prepare import prepare
+from .prepare import prepare, time_dtype
 from .start import Consistent
 from .times import checking_first_step, refusing_missing_times
 from .without_hook import solve_without_hook
@@ -57,7 +64,8 @@ def diffeqsolve(
 
     **Arguments:** as `diffrax.diffeqsolve`, and
 
-    - `solver`: [`Projected`][] or another solver of this library. (Any other Diffrax solver
+    - `solver`: [`Projected`][] or another solver of this library; with a constraint of no equations the
+        solver inside it, alone. (Any other Diffrax solver
         is passed on, for comparisons; implicit stages are solved to round-off there, too.)
         [`Rodas5P`][] and [`Rodas3P`][], alone or wrapped, for stiff equations; they take a
         [`MassMatrixTerm`][].
@@ -101,6 +109,8 @@ def diffeqsolve(
     """
     check_arguments(terms, solver, dt0, saveat, stepsize_controller, adjoint, event, consistent)
     check_max_steps(max_steps)
+    warn_of_rounding(y0, time_dtype(t0, t1, dt0, saveat), stepsize_controller)
+    solver = without_idle_hook(solver, t0, y0, args)
     adjoint = CheckedStartAdjoint(adjoint)
     if event is not None and event.root_finder is not None:
         adjoint = LocatingAdjoint(adjoint)
