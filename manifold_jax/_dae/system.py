@@ -64,8 +64,8 @@ class ReducedDAE(eqx.Module):
 
         **Returns:**
 
-        `(z, info)`: the state, moved across the manifold no more than necessary (the root of
-        `g(t0, z_guess + W^-1 G^T l) = 0` with `G` at the guess), then unknowns that became states
+        `(z, info)`: the state, the nearest one of the manifold in what is not fixed (the root of
+        `z - z_guess + W^-1 G^T lambda = 0`, `g(t0, z) = 0` with `G` at `z` itself), then unknowns that became states
         as equations are nonlinear in them, from those; and a [`ProjectionInfo`][]. The derivative
         with respect to all arguments is exact, however far the guess is.
 
