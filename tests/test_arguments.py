@@ -219,7 +219,9 @@ def test_parameters_into_which_jax_cannot_look():
     wrong = Unregistered()
     for call in (
         lambda: solve(args={"motor": wrong}),
-        lambda: mj.solve_ensemble(TURN, dfx.Heun(), 0.0, 1.0, 0.1, START[None], wrong, in_axes=None),
+        lambda: mj.solve_ensemble(
+            TURN, dfx.Heun(), 0.0, 1.0, 0.1, START[None], wrong, in_axes=None
+        ),
         lambda: mj.project(CIRCLE, 0.0, START, wrong),
     ):
         with pytest.raises(TypeError, match="`args` has a Unregistered.*register_dataclass"):

@@ -55,7 +55,7 @@ def test_solves_of_other_numbers_are_not_compiled_again(hook):
 
 
 def test_ensembles_of_other_numbers_are_not_compiled_again():
-    counted = Counted(field)
+    counted, calls = Counted(field), []
     for rate, t1 in ((0.7, 1.0), (0.9, 2.0)):
         mj.solve_ensemble(
             dfx.ODETerm(counted),
@@ -67,8 +67,8 @@ def test_ensembles_of_other_numbers_are_not_compiled_again():
             arguments(rate),
             in_axes=None,
         )
-        calls = counted.calls if t1 == 1.0 else calls
-    assert counted.calls == calls
+        calls.append(counted.calls)
+    assert calls[0] == calls[1]
 
 
 @pytest.mark.parametrize("function", [mj.project, mj.consistent_state, mj.constraint_violation])
@@ -97,7 +97,7 @@ def test_reduced_systems_of_other_numbers_are_not_compiled_again():
     calls = []
     for g, tension in ((9.81, 1 + 0.8 * 9.81), (1.62, 1 + 0.8 * 1.62)):
         z, _ = dae.consistent_state(0.0, example, g)
-        x, xdot = dae.outputs(0.0, z, g)
+        x, _ = dae.outputs(0.0, z, g)
         np.testing.assert_allclose(x[2], tension, rtol=1e-12)
         # Compiled, and differentiated, as a whole.
         several = jax.vmap(dae.outputs, in_axes=(None, 0, None))(0.0, jnp.stack([z, z]), g)

@@ -122,7 +122,8 @@ def test_undefined_accelerations_are_no_success(which, saved):
 
 def test_a_solve_of_diffrax_is_what_it_was():
     ts = jnp.linspace(0.0, 1.0, 3)
-    times = tuple(map(jnp.asarray, (0.0, 1.0, 0.1)))  # numbers are constants to Diffrax, which round otherwise
+    # Numbers are constants of the program to Diffrax, which rounds otherwise.
+    times = tuple(map(jnp.asarray, (0.0, 1.0, 0.1)))
     for saveat in (
         dfx.SaveAt(ts=ts, fn=lambda t, y, args: y[0]),
         dfx.SaveAt(subs={"a": dfx.SubSaveAt(t1=True), "b": dfx.SubSaveAt(steps=2)}, dense=True),

@@ -1,10 +1,8 @@
 """Times that are no numbers: NaN is neither a start nor an end, and never a success."""
 
 import diffrax as dfx
-import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 import pytest
 
 import manifold_jax as mj
@@ -124,7 +122,15 @@ def test_output_and_first_steps_of_ensembles():
 @pytest.mark.parametrize("t1", [NAN, lambda index, key: jnp.where(index == 0, NAN, 1.0)])
 def test_ensembles_on_disk(t1, tmp_path):
     stored = mj.stream_ensemble(
-        lambda index, key: (START, None), 2, tmp_path, TURN, dfx.Heun(), 0.0, t1, 0.1, progress=False
+        lambda index, key: (START, None),
+        2,
+        tmp_path,
+        TURN,
+        dfx.Heun(),
+        0.0,
+        t1,
+        0.1,
+        progress=False,
     )
     assert stored.num_failed == (1 if callable(t1) else 2)
     assert "is NaN" in stored.failures()[0][1]

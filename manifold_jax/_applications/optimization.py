@@ -17,8 +17,8 @@ from .._constraint import AbstractConstraint, Constraint
 from .._constraint_checks import check_constraint, check_state
 from .._custom_types import Args, BoolScalar, FloatScalar, RealScalarLike, Y
 from .._errors import clear_errors
-from .._numbers import numbers_as_arrays
 from .._newton import without_derivative
+from .._numbers import numbers_as_arrays
 from .._projection import NewtonProjection
 from .._residual import residual_vector, row_scale
 from .._solve import diffeqsolve

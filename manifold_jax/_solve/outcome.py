@@ -97,7 +97,8 @@ def is_unusable_start(number: Any, num_steps: Any) -> Any:
 
 def is_without_time(number: Any, num_steps: Any) -> Any:
     """The same for a time that is NaN."""
-    return (number == number_of_result(RESULTS.nonfinite_input)) & (num_steps == 0)
+    code = number_of_result(RESULTS.nonfinite_input)  # pyright: ignore[reportArgumentType]
+    return (number == code) & (num_steps == 0)
 
 
 def tangency_fault(
