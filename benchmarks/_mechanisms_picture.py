@@ -16,6 +16,7 @@ SHOWN = (
 def draw(rows: list[Any], path: Path) -> None:
     matplotlib.use("Agg")
     from matplotlib.figure import Figure
+    from matplotlib.ticker import LogLocator
 
     problems = list(dict.fromkeys(row.problem for row in rows))
     figure = Figure(figsize=(4 * len(problems) + 2, 8), layout="constrained")
@@ -29,6 +30,9 @@ def draw(rows: list[Any], path: Path) -> None:
                     axes.plot(*zip(*sorted(values), strict=True), marker, label=method)
             axes.set(xscale="log", yscale="log")
             axes.grid(alpha=0.3)
+            # Times span less than two powers of ten: one tick for each would say little.
+            axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+            axes.xaxis.set_major_formatter("{x:g}")
             axes.xaxis.set_minor_formatter("")
         column[0].set_title(problem)
         column[-1].set_xlabel("run, s")

@@ -20,6 +20,7 @@ from collections.abc import Callable
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import jax.tree_util as jtu
 from jaxtyping import Array, Float
 
 from ._constraint import AbstractConstraint
@@ -86,6 +87,18 @@ class AbstractChart(eqx.Module):
         """`state(y, w)`: a state near the one with coordinates `w` around `y`, for dense output,
         which is then corrected. `None` if that is `w` itself."""
         return None
+
+
+def check_state_like(chart: AbstractChart, origin: Y, y: Y) -> None:
+    """Refuse coordinates that cannot be states, of a chart that takes them for such."""
+    shapes = lambda tree: [jnp.shape(leaf) for leaf in jtu.tree_leaves(tree)]
+    if jtu.tree_structure(origin) == jtu.tree_structure(y) and shapes(origin) == shapes(y):
+        return
+    raise ValueError(
+        f"`chart={type(chart).__name__}` has coordinates of shape {jtu.tree_map(jnp.shape, origin)} for a state of shape "
+        f"{jtu.tree_map(jnp.shape, y)}, which are not states themselves: give the chart a property `state` that returns a "
+        "function `(y, w)`, the state near the one with coordinates `w` around `y`."
+    )
 
 
 class _Representatives(AbstractCoordinates):

@@ -57,6 +57,16 @@ def check_constraint_type(constraint: Any) -> None:
     raise TypeError(f"{got} The constraint comes first: `(constraint, t, y, args)`.")
 
 
+def has_no_equations(constraint: AbstractConstraint, t: RealScalarLike, y: Y, args: Args) -> bool:
+    """Whether every state satisfies it. Of a constraint that cannot be evaluated
+    [`check_constraint`][] says why."""
+    try:
+        leaves = jtu.tree_leaves(eqx.filter_eval_shape(constraint, t, y, args))
+    except Exception:
+        return False
+    return len(leaves) > 0 and all(getattr(leaf, "size", 1) == 0 for leaf in leaves)
+
+
 def check_constraint(constraint: AbstractConstraint, t: RealScalarLike, y: Y, args: Args) -> int:
     """Refuse, while tracing, constraints of the wrong type or shape; returns `m`."""
     check_constraint_type(constraint)
@@ -86,11 +96,14 @@ def check_constraint(constraint: AbstractConstraint, t: RealScalarLike, y: Y, ar
                 f"`constraint` returned a residual of type {leaf.dtype}; it must be real floating-point. "
                 "For complex equations return their real and imaginary parts."
             )
+    if not leaves:
+        raise ValueError("`constraint` returned no residual at all: is its `return` missing?")
     m = sum(leaf.size if isinstance(leaf, jax.ShapeDtypeStruct) else 1 for leaf in leaves)
     n = sum(jnp.size(leaf) for leaf in jtu.tree_leaves(y))
     if m == 0:
         raise ValueError(
-            "`constraint` returned an empty residual; without constraints use the solver alone."
+            "`constraint` returned an empty residual; without constraints use the solver alone, or `mj.diffeqsolve`, "
+            "which does so."
         )
     if m > n and not constraint.redundant:
         raise ValueError(

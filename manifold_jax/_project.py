@@ -12,6 +12,7 @@ from ._constraint_checks import check_constraint, check_constraint_type, check_s
 from ._custom_types import Args, RealScalarLike, Y
 from ._diagnosis import Diagnosis
 from ._errors import clear_errors
+from ._numbers import numbers_as_arrays
 from ._projection import NewtonProjection
 from ._projection_info import ProjectionInfo
 from ._rejection import is_finite
@@ -21,6 +22,7 @@ State = TypeVar("State")  # of the same structure goes in and comes out
 
 
 @clear_errors
+@numbers_as_arrays("y", "args", times=("t",))
 @eqx.filter_jit
 def project(
     constraint: AbstractConstraint,
@@ -65,6 +67,7 @@ def project(
 
 
 @clear_errors
+@numbers_as_arrays("y", "args", times=("t",))
 @eqx.filter_jit
 def consistent_state(
     constraint: AbstractConstraint,

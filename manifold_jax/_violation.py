@@ -13,10 +13,12 @@ from ._constraint_checks import check_constraint, check_constraint_type, check_s
 from ._correction import equations_of
 from ._custom_types import Args, FloatScalar, Y
 from ._errors import clear_errors
+from ._numbers import numbers_as_arrays
 from ._projection import NewtonProjection
 
 
 @clear_errors
+@numbers_as_arrays("y", "args", times=("t",))
 @eqx.filter_jit
 def constraint_violation(
     constraint: AbstractConstraint, t: Any, y: Y, args: Args = None

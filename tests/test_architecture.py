@@ -20,6 +20,7 @@ LAYERS = [
         "_compat",
         "_errors",
         "_extras",
+        "_numbers",
         "_terminal_bar",
         "_traced_length",
         "_user_function",

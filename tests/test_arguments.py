@@ -1,8 +1,12 @@
 """Arguments of the wrong kind: what the user reads names the argument and what to write instead."""
 
+import dataclasses
+from typing import Any
+
 import diffrax as dfx
 import jax.numpy as jnp
 import numpy as np
+import optimistix
 import pytest
 
 import manifold_jax as mj
@@ -187,3 +191,84 @@ def test_one_state_where_an_ensemble_has_many():
     assert (
         "Of the 2 trajectories of `y0s` each has a state of shapes ()" in error.value.__notes__[0]
     )
+
+
+@pytest.mark.parametrize("max_steps", [100.0, 0, -3, "many"])
+def test_numbers_of_steps(max_steps):
+    for solver in (PROJECTED, dfx.Heun()):
+        with pytest.raises(ValueError, match="`max_steps` must be a positive integer"):
+            solve(solver=solver, max_steps=max_steps)
+    assert solve(max_steps=16).result == dfx.RESULTS.successful
+
+
+def test_a_field_unlike_the_state():
+    row = dfx.ODETerm(lambda t, y, args: jnp.stack([-y[1], y[0]])[None])
+    for solver in (PROJECTED, dfx.Heun()):
+        with pytest.raises(ValueError, match=r"vector field.*\(2,\), but returns \(1, 2\)"):
+            solve(terms=row, solver=solver)
+    with pytest.raises(ValueError, match=r"vector field.*\(2,\), but returns \(1, 2\)"):
+        mj.solve_ensemble(row, dfx.Heun(), 0.0, 1.0, 0.1, START[None])
+
+
+@dataclasses.dataclass
+class Unregistered:
+    rate: float = 1.0
+
+
+def test_parameters_into_which_jax_cannot_look():
+    wrong = Unregistered()
+    for call in (
+        lambda: solve(args={"motor": wrong}),
+        lambda: mj.solve_ensemble(
+            TURN, dfx.Heun(), 0.0, 1.0, 0.1, START[None], wrong, in_axes=None
+        ),
+        lambda: mj.project(CIRCLE, 0.0, START, wrong),
+    ):
+        with pytest.raises(TypeError, match="`args` has a Unregistered.*register_dataclass"):
+            call()
+
+
+def test_an_event_function_that_is_nan():
+    nowhere = lambda t, y, args, **kwargs: jnp.log(y[0] - 2.0)
+    event = dfx.Event(nowhere, optimistix.Newton(1e-6, 1e-6))
+    with pytest.raises(RuntimeError, match="met NaN: the function in `event`"):
+        solve(event=event)
+
+
+class Flat(mj.AbstractChart):
+    """Coordinates of another shape than the state, and no `state`."""
+
+    def at(self, constraint, projection, t, y, args):
+        return Angle(jnp.zeros((), y.dtype), y)
+
+
+class Angle(mj.AbstractCoordinates):
+    origin: Any
+    centre: Any
+
+    def lift(self, t, w, args):
+        c, s = jnp.cos(w), jnp.sin(w)
+        x, y = self.centre
+        p = jnp.stack([c * x - s * y, s * x + c * y])
+        return p, mj.ProjectionInfo.of_nothing(p, jnp.asarray(True))
+
+    def pull_back(self, t, w, y, vector):
+        return y[0] * vector[1] - y[1] * vector[0]
+
+    def push_forward(self, t, w, y, args, error):
+        return error * jnp.stack([-y[1], y[0]])
+
+
+def test_a_chart_whose_coordinates_are_no_states():
+    solver = mj.LocalCoordinates(dfx.Heun(), CIRCLE, chart=Flat())
+    for controller in (dfx.ConstantStepSize(), dfx.PIDController(1e-6, 1e-6)):
+        with pytest.raises(ValueError, match=r"`chart=Flat`.*shape \(\).*\(2,\).*property `state`"):
+            solve(solver=solver, stepsize_controller=controller)
+
+
+def test_a_group_for_several_arrays():
+    field = dfx.ODETerm(lambda t, y, args: y)
+    constraint = mj.Product((mj.Stiefel(), None))
+    solver = mj.LocalCoordinates(dfx.Heun(), constraint, chart=mj.LieGroupChart(mj.SO3()))
+    with pytest.raises(ValueError, match="`groups` of `mj.LieGroupChart` must be like the state"):
+        solve(terms=field, solver=solver, y0=(jnp.eye(3), START))

@@ -46,8 +46,7 @@ def test_empty_state():
     ("residual", "error", "message"),
     [
         (lambda t, y, args: jnp.concatenate([y, y]), ValueError, "4 residuals.*2 numbers.*Remove"),
-        (lambda t, y, args: jnp.zeros(0), ValueError, "empty residual"),
-        (lambda t, y, args: None, ValueError, "empty residual"),
+        (lambda t, y, args: None, ValueError, "no residual at all.*`return`"),
         (lambda t, y, args: jnp.asarray(1), TypeError, "residual of type int"),
         (lambda t, y, args: y[0].astype(complex), TypeError, "complex128.*real and imaginary"),
         (lambda t, y, args: "on", TypeError, "leaf of type str"),
@@ -174,3 +173,27 @@ def test_violation_of_mismatched_trajectories():
         mj.constraint_violation(CIRCLE, jnp.zeros(3), jnp.zeros((4, 2)))
     with pytest.raises(ValueError, match="scalar or of shape"):
         mj.constraint_violation(CIRCLE, jnp.zeros((3, 3)), jnp.zeros((3, 2)))
+
+
+@pytest.mark.parametrize(
+    "hook",
+    [
+        mj.Projected,
+        mj.LocalCoordinates,
+        lambda *a: mj.Stabilized(*a, stabilization=mj.InvariantStabilization(1.0)),
+    ],
+    ids=["projected", "coordinates", "stabilized"],
+)
+def test_a_constraint_of_no_equations_leaves_the_solver_alone(hook):
+    nothing = mj.Constraint(lambda t, y, args: jnp.zeros(0))
+    options = dict(stepsize_controller=dfx.PIDController(1e-3, 1e-3))
+    call = lambda solver: mj.diffeqsolve(TURN, solver, 0.0, 1.0, 0.1, START, **options)
+    hooked, plain = call(hook(dfx.Bosh3(), nothing)), call(dfx.Bosh3())
+    assert np.array_equal(hooked.ys, plain.ys)
+    assert hooked.stats["num_steps"] == plain.stats["num_steps"]
+    batch = mj.solve_ensemble(
+        TURN, hook(dfx.Bosh3(), nothing), 0.0, 1.0, 0.1, START[None], **options
+    )
+    np.testing.assert_allclose(batch.ys[0], plain.ys, atol=1e-15)
+    with pytest.raises(ValueError, match=r"empty residual.*mj.diffeqsolve"):
+        dfx.diffeqsolve(TURN, hook(dfx.Bosh3(), nothing), 0.0, 1.0, 0.1, START)

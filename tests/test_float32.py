@@ -1,5 +1,7 @@
 """Single precision: nothing hangs, nothing is NaN, and the manifold is met to its rounding."""
 
+import warnings
+
 import diffrax as dfx
 import jax
 import jax.flatten_util as jfu
@@ -78,3 +80,26 @@ def test_projection_tolerance_follows_the_type():
     assert p.dtype == jnp.float32
     assert bool(info.success)
     np.testing.assert_allclose(np.sum(np.square(p)), 1, atol=3e-7)
+
+
+def test_tolerances_below_rounding():
+    """They made steps of rounding size until `max_steps`, or an error that was none."""
+    still = dfx.ODETerm(lambda t, y, args: -y)
+    y0 = jnp.ones(2, jnp.float32)
+
+    def solve(y0, rtol, atol, function=mj.diffeqsolve):
+        controller = dfx.PIDController(rtol, atol)
+        options = dict(stepsize_controller=controller, throw=False, max_steps=8)
+        times = single((0.0, 0.1))  # those of 64 bits make such a state
+        return function(still, dfx.Heun(), *times, None, y0, **options)
+
+    for rtol, atol in ((1e-8, 1e-8), (1e-7, 0.0)):
+        with pytest.warns(UserWarning, match="below the rounding of float32.*1e-06.*64"):
+            solve(y0, rtol, atol)
+    with pytest.warns(UserWarning, match="below the rounding of float32"):
+        solve(y0[None], 1e-9, 1e-9, mj.solve_ensemble)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        solve(y0, 1e-6, 1e-8)
+        solve(y0, jnp.asarray(1e-8), 1e-8)  # unknown while tracing
+        solve(jnp.ones(2), 1e-8, 1e-8)

@@ -4,6 +4,8 @@ import ast
 import builtins
 import re
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from documents import blocks_of, ROOT, run
@@ -31,7 +33,12 @@ def check_first_solve(namespace):
 def check_mechanism(namespace):
     q = np.asarray(namespace["motion"].ys[0][-1])
     np.testing.assert_allclose(np.linalg.norm([q[0], q[1] - q[0]], axis=1), 1, atol=1e-15)
-    assert namespace["forces"].shape == (2,)
+    rods, end, multipliers = (namespace[name] for name in ("rods", "end", "multipliers"))
+    jacobian = jax.jacobian(lambda q: rods(5.0, q, None))(end[0])
+    pull = -jnp.einsum("i,ijk->jk", multipliers, jacobian)
+    accelerations = namespace["system"].accelerations(5.0, end)
+    expected = jnp.array([[0.0, -9.81], [0.0, -9.81]]) + pull
+    np.testing.assert_allclose(accelerations, expected, rtol=0, atol=1e-12)
 
 
 def check_dae(namespace):

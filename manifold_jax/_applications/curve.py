@@ -16,6 +16,7 @@ from .._compat import nonlinear_failure
 from .._constraint_checks import check_state
 from .._custom_types import Args, IntScalar, RealScalarLike
 from .._errors import clear_errors
+from .._numbers import numbers_as_arrays
 from .checks import as_curve_start, as_direction, check_counts, check_function, raise_if_failed
 from .following import Curve, follow, start_on, unbroken
 from .turning_points import find_turns
@@ -62,6 +63,7 @@ class CurveTrace(eqx.Module):
 
 
 @clear_errors
+@numbers_as_arrays("x0", "args", times=("length",))
 @eqx.filter_jit
 def trace_curve(
     function: Callable[[Float[Array, " k"], Args], Float[Array, " n"]],

@@ -19,6 +19,7 @@ from .._constraint_checks import check_constraint, check_state
 from .._custom_types import Args, BoolScalar, FloatScalar, RealScalarLike, Y
 from .._errors import clear_errors
 from .._newton import without_derivative
+from .._numbers import numbers_as_arrays
 from .._projection import NewtonProjection
 from .._residual import residual_vector, row_scale
 from .._solve import diffeqsolve
@@ -77,6 +78,7 @@ class ConstrainedMinimum(eqx.Module):
 
 
 @clear_errors
+@numbers_as_arrays("x0", "args", times=("t1",))
 @eqx.filter_jit
 def gradient_flow(
     objective: Callable[[Y, Args], FloatScalar],

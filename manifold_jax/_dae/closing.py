@@ -49,10 +49,6 @@ class Plan(NamedTuple):
             rest = self.layout.jet(0)(jnp.zeros_like(z), jax.lax.stop_gradient(w))
         return jnp.where(known, x, rest), *others
 
-    def rows_below(self, k: int) -> np.ndarray:
-        """Equations that are differentiated more than `k` times: `F^(k)` holds of states alone."""
-        return self.layout.aliases.rows[self.layout.structure.c > k]
-
     @property
     def differentiations(self) -> int:
         return int(self.layout.structure.c.max(initial=0))

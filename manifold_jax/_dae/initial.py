@@ -15,6 +15,7 @@ from .._custom_types import Args, BoolScalar, RealScalarLike, Y
 from .._errors import clear_errors
 from .._linear import gram
 from .._newton import without_derivative
+from .._numbers import numbers_as_arrays
 from .._projection import NewtonProjection
 from .._projection_info import ProjectionInfo
 from .._residual import as_time, jacobian, row_scale
@@ -120,6 +121,7 @@ def _raise_unless(success: BoolScalar, z: Array, cause: Array, messages: tuple[s
     return eqx.branched_error_if(z, ~success, cause, messages)
 
 
+@numbers_as_arrays("args")
 @eqx.filter_jit
 def _found(
     system: Reduced, t: Array, guess: Array, w: Array, held: tuple[bool, ...], args: Args

@@ -11,6 +11,7 @@ import jax.tree_util as jtu
 import numpy as np
 
 from .._custom_types import Args, Y
+from .._numbers import with_arrays
 from .aliases import Aliases
 from .closing import Plan, Static
 from .combined import cancelled
@@ -108,6 +109,7 @@ def reduce_dae(
         raise ValueError(f"`form` must be 'ode' or 'index-1', got {form!r}.")
     implicit = form == "index-1"
     _check_concrete(x_example, args_example)
+    args_example = with_arrays(args_example)  # as they will be used
     equations = Equations.of(F, x_example, args_example, order)
     x = jfu.ravel_pytree(jtu.tree_map(jnp.asarray, x_example))[0]
     point = Point.of(equations, x, args_example)

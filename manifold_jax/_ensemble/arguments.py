@@ -13,6 +13,7 @@ from jaxtyping import Array
 from .._constraint_checks import check_state
 from .._custom_types import Args, Y
 from .._solve.prepare import time_dtype
+from .._solve.times import is_no_step, NO_FIRST_STEP, NO_OUTPUT_TIME
 from .axes import anywhere, Axes
 from .trajectory import Given
 
@@ -67,6 +68,7 @@ def checked_step(dt0: Any, batch: Batch, axes: Axes) -> Any:
         return None
     t0, t1 = _ends(batch)
     dt0 = jnp.asarray(dt0, batch.dtype)
+    dt0 = eqx.error_if(dt0, is_no_step(dt0), NO_FIRST_STEP)
     message = "`dt0` must have the sign of t1 - t0 in all trajectories; None chooses it for each."
     return eqx.error_if(dt0, anywhere((t1 - t0) * dt0 < 0, axes), message)
 
@@ -84,6 +86,7 @@ def checked_times(saveat: dfx.SaveAt, batch: Batch, axes: Axes) -> dfx.SaveAt:
         before, behind = t0[:, None] * direction, t1[:, None] * direction
         outside = anywhere((ahead < before) | (ahead > behind), axes)
         unsorted = anywhere(ahead[:, 1:] < ahead[:, :-1], axes)
+        ts = eqx.error_if(ts, jnp.isnan(ts), NO_OUTPUT_TIME)
         ts = eqx.error_if(ts, unsorted, "`saveat.ts` must be sorted from t0 to t1.")
         ts = eqx.error_if(
             ts, outside, "`saveat.ts` must lie between t0 and t1 of all trajectories."

@@ -11,7 +11,13 @@ from diffrax import RESULTS
 from jaxtyping import Array, PyTree
 
 from .._compat import is_okay, number_of_result
-from .._solve.outcome import is_unusable_start, messages_for, UNUSABLE_START
+from .._solve.outcome import (
+    is_unusable_start,
+    is_without_time,
+    messages_for,
+    NO_TIME,
+    UNUSABLE_START,
+)
 
 
 class EnsembleSolution(eqx.Module):
@@ -23,8 +29,8 @@ class EnsembleSolution(eqx.Module):
     - `stats`: as of [`diffeqsolve`][] without `max_steps`, each of shape `(N,)`.
     - `result`: the result codes of all trajectories.
     - `execution`: "in lanes", or why not.
-    - `messages`: what the result codes mean, by number; the last one says of a trajectory without steps
-        that its start could not be used.
+    - `messages`: what the result codes mean, by number; the last two say of a trajectory without steps
+        that its times or its start could not be used.
     """
 
     ts: PyTree[Array]
@@ -42,8 +48,10 @@ class EnsembleSolution(eqx.Module):
     def reasons(self) -> Array:
         """Numbers of `messages`, shape `(N,)`, 0 where a trajectory is successful."""
         codes = number_of_result(self.result)
-        unusable = is_unusable_start(codes, self.stats["num_steps"])
-        return jnp.where(self.failed, jnp.where(unusable, len(self.messages) - 1, codes), 0)
+        num_steps, last = self.stats["num_steps"], len(self.messages) - 1
+        codes = jnp.where(is_without_time(codes, num_steps), last - 1, codes)
+        codes = jnp.where(is_unusable_start(codes, num_steps), last, codes)
+        return jnp.where(self.failed, codes, 0)
 
     def failures(self, most: int = 10) -> list[tuple[int, str]]:
         """Numbers and reasons of the first that failed; not under `jit`. Of several processes each
@@ -58,4 +66,4 @@ class EnsembleSolution(eqx.Module):
 
 def messages_of(solver: dfx.AbstractSolver) -> tuple[str, ...]:
     """What `EnsembleSolution.reasons` are numbers of."""
-    return (*messages_for(solver), UNUSABLE_START)
+    return (*messages_for(solver), NO_TIME, UNUSABLE_START)

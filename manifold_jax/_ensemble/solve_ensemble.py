@@ -14,8 +14,15 @@ from jaxtyping import Array
 from .._adjoint import StepReplayAdjoint
 from .._custom_types import Args, RealScalarLike, Y
 from .._errors import clear_errors
-from .._solve.arguments import check_arguments
+from .._numbers import numbers_as_arrays
+from .._solve.arguments import (
+    check_arguments,
+    fault_of_field,
+    warn_of_rounding,
+    without_idle_hook,
+)
 from .._solve.start import Consistent
+from .._solve.times import checking_first_step
 from .arguments import Batch, checked_batch, checked_step, checked_times
 from .axes import anywhere, Axes, largest
 from .devices import check_mesh, over_devices
@@ -26,6 +33,8 @@ from .trajectory import Equations
 
 
 @clear_errors
+@checking_first_step
+@numbers_as_arrays("y0s", "args", times=("t0", "t1", "dt0"))
 @eqx.filter_jit
 def solve_ensemble(
     terms: dfx.AbstractTerm,
@@ -97,6 +106,9 @@ def solve_ensemble(
     batch = checked_batch(t0, t1, dt0, y0s, args, in_axes, saveat, lanes)
     if not isinstance(max_steps, int) or max_steps < 1:
         raise ValueError(f"`max_steps` must be a positive integer, got {max_steps!r}.")
+    one = jax.eval_shape(batch.one)
+    warn_of_rounding(one.y0, batch.dtype, stepsize_controller)
+    solver = without_idle_hook(solver, one.t0, one.y0, one.args)
     equations = Equations(
         terms, solver, stepsize_controller, saveat, dt0, adjoint, max_steps, consistent
     )
@@ -109,6 +121,8 @@ def solve_ensemble(
         try:
             solution = solve_on_one_device(inputs, lanes)
         except Exception as error:
+            if fault := fault_of_field(equations.terms, one.t0, one.y0, one.args):
+                raise ValueError(fault) from error
             error.add_note(_example(inputs[1]))
             raise
         solution = dataclasses.replace(solution, messages=messages_of(solver))

@@ -17,6 +17,7 @@ from .._custom_types import Args, BoolScalar, FloatScalar, IntScalar, RealScalar
 from .._rejection import result_of_state
 from .._solve.prepare import prepare, Ready
 from .._solve.start import Consistent
+from .._solve.times import is_time_missing
 from .._solver.advance import HookState, StepStatistics
 from .unconstrained import Unconstrained
 
@@ -100,6 +101,8 @@ class Equations(eqx.Module):
             solver_state = solver.init(terms, t0, tnext, ready.y0, args)
         result = RESULTS.where(ready.start.success, RESULTS.successful, nonlinear_failure())
         result = update_result(result, result_of_state(ready.y0))
+        missing = is_time_missing(given.t0, given.t1)
+        result = RESULTS.where(missing, RESULTS.nonfinite_input, result)  # pyright: ignore[reportArgumentType]
         zero = jnp.zeros((), jnp.int32)
         trajectory = Trajectory(
             t0, tnext, ready.y0, solver_state, controller_state, result, zero, zero

@@ -97,11 +97,16 @@ class LieGroupChart(mj.AbstractChart):
     def parts(self, y: Any) -> list[tuple[AbstractLieGroup | None, Any]]:
         groups, structure = jtu.tree_flatten(self.groups, is_leaf=_is_group)
         try:
-            return list(zip(groups, structure.flatten_up_to(y), strict=True))
-        except ValueError as error:
+            parts = list(zip(groups, structure.flatten_up_to(y), strict=True))
+        except ValueError:
+            parts = None
+        # A group is of one array, not of all that is in a part of the state.
+        if parts is None or not all(group is None or eqx.is_array(y) for group, y in parts):
             raise ValueError(
-                f"`groups` of `mj.LieGroupChart` must be like the state, {jtu.tree_structure(y)}, got {self.groups}."
-            ) from error
+                f"`groups` of `mj.LieGroupChart` must be like the state, {jtu.tree_structure(y)}, with a group or None "
+                f"for each of its arrays, got {self.groups}."
+            )
+        return parts
 
 
 class _LieCoordinates(mj.AbstractCoordinates):

@@ -14,6 +14,7 @@ from .._constraint_checks import check_state
 from .._custom_types import Args, RealScalarLike, Y
 from .._diagnosis import Diagnosis
 from .._errors import clear_errors
+from .._numbers import numbers_as_arrays
 from .._projection_info import ProjectionInfo
 from .._rows import multiply
 from .._user_function import check_function
@@ -117,6 +118,7 @@ class MassMatrixTerm(dfx.AbstractTerm):
 
 
 @clear_errors
+@numbers_as_arrays("y", "args", times=("t",))
 @eqx.filter_jit
 def _consistent_state(
     term: MassMatrixTerm, t: RealScalarLike, y: Y, args: Args, throw: bool

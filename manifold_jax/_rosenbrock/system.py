@@ -38,10 +38,6 @@ class System(NamedTuple):
         return System(terms, mass, t0, t1, y0, args)
 
     @property
-    def state_dependent(self) -> bool:
-        return self.mass is not None and callable(self.mass.mass)
-
-    @property
     def step(self) -> Array:
         return jnp.asarray(self.t1) - self.t0
 

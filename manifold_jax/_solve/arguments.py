@@ -1,19 +1,28 @@
 """Arguments of `mj.diffeqsolve` that cannot work, refused with what to write instead."""
 
-from typing import Any
+import functools
+import inspect
+import warnings
+from collections.abc import Callable
+from typing import Any, cast, TypeVar
 
 import diffrax as dfx
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 
 from .._compat import save_y
-from .._custom_types import RealScalarLike, Y
+from .._constraint_checks import has_no_equations
+from .._custom_types import Args, RealScalarLike, Y
 from .._directed_term import DirectedTerm
 from .._solver import Stabilized
+from .._solver.base import AbstractManifoldSolver, controller_tolerances
 from .._stability import is_stable, stability_interval
 from .._user_function import check_function
 
+
+Function = TypeVar("Function", bound=Callable)
 
 # What Diffrax passes to an event function by name.
 _EVENT_KEYWORDS = ("terms", "solver", "t0", "t1", "dt0", "saveat", "stepsize_controller")
@@ -58,12 +67,52 @@ def check_arguments(
             "`dt0` is None, but the size of the steps is constant: give it, or let "
             "`stepsize_controller=diffrax.PIDController(rtol=1e-6, atol=1e-6)` choose."
         )
-    if isinstance(dt0, int | float) and not abs(dt0) > 0:
-        raise ValueError(
-            f"`dt0` must be the length of the first step, with the sign of t1 - t0, got {dt0}. With an adaptive "
-            "`stepsize_controller` it may be None."
-        )
     _check_choices(adjoint, consistent)
+
+
+def check_max_steps(max_steps: Any) -> None:
+    if max_steps is None or (isinstance(max_steps, int) and max_steps > 0):
+        return
+    raise ValueError(
+        f"`max_steps` must be a positive integer, or None for no bound, got {max_steps!r}."
+    )
+
+
+def explained(function: Function) -> Function:
+    """Around a solve: of an error in it that comes from a vector field unlike the state, say so."""
+    signature = inspect.signature(function)
+
+    @functools.wraps(function)
+    def solve(*args: Any, **kwargs: Any) -> Any:
+        __tracebackhide__ = True
+        try:
+            return function(*args, **kwargs)
+        except (TypeError, ValueError) as error:
+            given = signature.bind(*args, **kwargs).arguments
+            fault = fault_of_field(*(given.get(name) for name in ("terms", "t0", "y0", "args")))
+            if fault is None:
+                raise
+            raise ValueError(fault) from error
+
+    return cast(Function, solve)
+
+
+def fault_of_field(terms: Any, t0: Any, y0: Any, args: Any) -> str | None:
+    """What to say of a vector field of another shape than the state."""
+    if not isinstance(terms, dfx.ODETerm):
+        return None
+    try:
+        field = eqx.filter_eval_shape(terms.vector_field, t0, y0, args)
+    except Exception:  # which is the error itself
+        return None
+    shapes = [[jnp.shape(leaf) for leaf in jtu.tree_leaves(tree)] for tree in (field, y0)]
+    if jtu.tree_structure(field) != jtu.tree_structure(y0) or shapes[0] == shapes[1]:
+        return None  # Diffrax speaks of other structures
+    got, state = (jtu.tree_map(jnp.shape, tree) for tree in (field, y0))
+    return (
+        f"The vector field in `terms` must be like the state, of shape {state}, but returns {got}: one velocity for "
+        "every number of `y`."
+    )
 
 
 def _check_choices(adjoint: Any, consistent: str) -> None:
@@ -106,6 +155,33 @@ def _check_kind(name: str, value: Any, kind: type, example: str) -> None:
         got = repr(value) if isinstance(value, str) else type(value).__name__
         raise TypeError(
             f"`{name}` must be a `diffrax.{kind.__name__}`, got {got}. Write e.g. `{example}`."
+        )
+
+
+def without_idle_hook(solver: Any, t0: RealScalarLike, y0: Y, args: Args) -> Any:
+    """The solver alone where its hook has no equations to keep, as systems that are reduced or
+    generated may have none."""
+    if not isinstance(solver, AbstractManifoldSolver):
+        return solver
+    return solver.inner if has_no_equations(solver.constraint, t0, y0, args) else solver
+
+
+def warn_of_rounding(y0: Y, time: Any, controller: Any) -> None:
+    """Tolerances that are known, and below what numbers of 32 bits can tell apart."""
+    tolerances = controller_tolerances(controller)
+    if tolerances is None or not all(
+        isinstance(x, int | float) for x in (tolerances.rtol, tolerances.atol)
+    ):
+        return
+    with jax.numpy_dtype_promotion("standard"):
+        dtype = jnp.result_type(time, *jtu.tree_leaves(y0))
+    largest = max(tolerances.rtol, tolerances.atol)
+    if jnp.issubdtype(dtype, jnp.floating) and largest < 5 * jnp.finfo(dtype).eps:
+        warnings.warn(
+            f"`rtol` and `atol` of `stepsize_controller` are at most {largest:g}, below the rounding of {dtype} numbers, "
+            f"{jnp.finfo(dtype).eps:.0e}: steps become tiny and gain nothing. Use tolerances from "
+            f'{10 * jnp.finfo(dtype).eps:.0e} on, or 64 bits (`jax.config.update("jax_enable_x64", True)`).',
+            stacklevel=2,
         )
 
 

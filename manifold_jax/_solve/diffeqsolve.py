@@ -8,19 +8,32 @@ import equinox as eqx
 from .._adjoint import CheckedStartAdjoint, LocatingAdjoint, StepReplayAdjoint
 from .._custom_types import Args, RealScalarLike, Y
 from .._errors import clear_errors
+from .._numbers import numbers_as_arrays
 from .._of_args import evaluated
 from .._solver.base import AbstractManifoldSolver
-from .arguments import check_arguments, raise_if_unstable
+from .arguments import (
+    check_arguments,
+    check_max_steps,
+    explained,
+    raise_if_unstable,
+    warn_of_rounding,
+    without_idle_hook,
+)
 from .finish import finish
 from .mass_matrix import trusting
 from .output import events_in_true_time, on_manifold_saving
-from .prepare import prepare
+from .prepare import prepare, time_dtype
 from .start import Consistent
+from .times import checking_first_step, refusing_missing_times
 from .without_hook import solve_without_hook
 
 
 @clear_errors
+@checking_first_step
+@numbers_as_arrays("y0", "args", times=("t0", "t1", "dt0"))
 @eqx.filter_jit
+@refusing_missing_times
+@explained
 def diffeqsolve(
     terms: Any,
     solver: dfx.AbstractSolver,
@@ -51,7 +64,8 @@ def diffeqsolve(
 
     **Arguments:** as `diffrax.diffeqsolve`, and
 
-    - `solver`: [`Projected`][] or another solver of this library. (Any other Diffrax solver
+    - `solver`: [`Projected`][] or another solver of this library; with a constraint of no equations the
+        solver inside it, alone. (Any other Diffrax solver
         is passed on, for comparisons; implicit stages are solved to round-off there, too.)
         [`Rodas5P`][] and [`Rodas3P`][], alone or wrapped, for stiff equations; they take a
         [`MassMatrixTerm`][].
@@ -67,8 +81,9 @@ def diffeqsolve(
         differently and get other sizes: where tolerances are tight their gradients are less
         accurate than the solution.
 
-    Python numbers among the arguments (`t1`, tolerances) are part of the compiled program; pass
-    `jnp.asarray(...)` to solve with other values without compiling again.
+    Real numbers of Python in `y0` and `args`, and all in `t0`, `t1` and `dt0`, become arrays: other
+    values are not compiled again. Whole numbers in `args`, which may be shapes, and tolerances are part of
+    the compiled program; pass `jnp.asarray(...)` where they vary.
 
     **Returns:**
 
@@ -86,12 +101,15 @@ def diffeqsolve(
     `TypeError` or `ValueError` for arguments that cannot work. With `throw=True` a
     `RuntimeError` where the solve fails; with `throw=False` look at `sol.result`:
     `RESULTS.nonlinear_divergence` is a constraint that could not be satisfied, or is NaN where it is
-    evaluated, and `RESULTS.nonfinite` a state that is NaN or infinite otherwise, with a constant step
+    evaluated, `RESULTS.nonfinite_input` a time that is NaN, and `RESULTS.nonfinite` a state that is NaN or infinite otherwise, with a constant step
     size also for a solver of Diffrax alone.
 
     Source: Sudarsan & Keerthi, Appl. Math. Comput. 92 (1998) 153-193.
     """
     check_arguments(terms, solver, dt0, saveat, stepsize_controller, adjoint, event, consistent)
+    check_max_steps(max_steps)
+    warn_of_rounding(y0, time_dtype(t0, t1, dt0, saveat), stepsize_controller)
+    solver = without_idle_hook(solver, t0, y0, args)
     adjoint = CheckedStartAdjoint(adjoint)
     if event is not None and event.root_finder is not None:
         adjoint = LocatingAdjoint(adjoint)

@@ -32,6 +32,11 @@ _NOT_FINITE = (
     "The state is not finite (NaN or infinite) from some time on: the vector field is not defined on the way. For an "
     "`mj.MechanicalSystem` the mass matrix is not positive definite there, or constraints depend on each other."
 )
+_NAN_INSIDE = (
+    "The search for the time of an event, or for a stage of an implicit method, met NaN: the function in `event` or the "
+    "vector field in `terms` is not defined near the step."
+)
+NO_TIME = "`t0` or `t1` is NaN (or `t0` infinite): nothing was solved."
 _SINGULAR = (
     "A step could not be made: `y0` does not satisfy the algebraic equations (see "
     "`mj.MassMatrixTerm.consistent_state`), or the matrix M - h gamma df/dy is singular or not finite, as where the index "
@@ -74,6 +79,7 @@ def messages_for(solver: dfx.AbstractSolver) -> list[str]:
     """What the result codes of a solve mean, by number, instead of what Diffrax says."""
     messages = messages_of_results()
     texts = [(RESULTS.max_steps_reached, _TOO_MANY), (RESULTS.nonfinite, _NOT_FINITE)]
+    texts.append((RESULTS.nonfinite_input, _NAN_INSIDE))
     if isinstance(solver, AbstractManifoldSolver):
         text = _NOT_CORRECTED if solver.corrects_output else _TOO_LONG
         texts.append((nonlinear_failure(), text))
@@ -87,6 +93,12 @@ def messages_for(solver: dfx.AbstractSolver) -> list[str]:
 def is_unusable_start(number: Any, num_steps: Any) -> Any:
     """Whether a trajectory failed before its first step, from the number of its result code."""
     return (number == number_of_result(nonlinear_failure())) & (num_steps == 0)
+
+
+def is_without_time(number: Any, num_steps: Any) -> Any:
+    """The same for a time that is NaN."""
+    code = number_of_result(RESULTS.nonfinite_input)  # pyright: ignore[reportArgumentType]
+    return (number == code) & (num_steps == 0)
 
 
 def tangency_fault(

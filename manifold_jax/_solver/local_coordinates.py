@@ -9,7 +9,12 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from diffrax import RESULTS
 
-from .._chart import AbstractChart, AbstractCoordinates, TangentSpaceChart
+from .._chart import (
+    AbstractChart,
+    AbstractCoordinates,
+    check_state_like,
+    TangentSpaceChart,
+)
 from .._compat import is_sde, time_direction
 from .._constraint import AbstractConstraint
 from .._constraint_checks import check_constraint
@@ -125,6 +130,8 @@ class LocalCoordinates(AbstractManifoldSolver):
     ) -> "_DirectedCoordinates":
         direction = time_direction(terms)
         of = self.chart.at(self.constraint, self.projection, t0 * direction, y0, args)
+        if self.chart.state is None:
+            check_state_like(self.chart, of.origin, y0)
         return _DirectedCoordinates(of, y0, direction)
 
 

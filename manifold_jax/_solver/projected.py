@@ -22,8 +22,9 @@ class Projected(AbstractManifoldSolver):
     """Any one-step solver, followed by a correction of the state onto the manifold:
     `y1 = pi(Phi_h(y0))`, `g(t1, y1, args) = 0` (projection; the paper's perturbation approach).
 
-    The order of the wrapped solver is kept, and the step sizes are chosen by its own error
-    estimate. A step that cannot be corrected is rejected and repeated with a smaller one;
+    The order of the wrapped solver is kept. The step size controller chooses the steps, from the
+    solver's error estimate before the correction; [`mj.diffeqsolve`][] with an adaptive one also counts
+    the correction as an error, where it is the larger of both. A step that cannot be corrected is rejected and repeated with a smaller one;
     if no smaller one is possible (constant steps, or steps at the limit of the time's
     precision) the solve ends with `RESULTS.nonlinear_divergence`.
 

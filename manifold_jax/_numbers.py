@@ -1,0 +1,69 @@
+"""Python's numbers among the arguments of functions that are compiled."""
+
+import functools
+import inspect
+from collections.abc import Callable, Hashable
+from typing import Any, cast, TypeVar
+
+import equinox as eqx
+import jax
+import jax.core
+import jax.numpy as jnp
+import jax.tree_util as jtu
+
+
+Function = TypeVar("Function", bound=Callable)
+
+
+def numbers_as_arrays(*names: str, times: tuple[str, ...] = ()) -> Callable[[Function], Function]:
+    """Around a function made by `equinox.filter_jit`, for which every other number is another
+    program: those in the arguments with these names become arrays, weakly typed as Python's numbers
+    are. Whole numbers, which may be shapes or exponents, stay what they are, but for `times`."""
+
+    def decorate(function: Function) -> Function:
+        parameters = list(inspect.signature(function).parameters)
+
+        def converted(name: str, value: Any) -> Any:
+            if name in times:
+                return _time_as_array(value)
+            return with_arrays(_checked(name, value)) if name in names else value
+
+        @functools.wraps(function)
+        def call(*args: Any, **kwargs: Any) -> Any:
+            __tracebackhide__ = True
+            args = (*map(converted, parameters, args), *args[len(parameters) :])
+            return function(*args, **{name: converted(name, x) for name, x in kwargs.items()})
+
+        return cast(Function, call)
+
+    return decorate
+
+
+def _checked(name: str, tree: Any) -> Any:
+    """Refuse objects that JAX can neither look into nor compare with those of another call."""
+    for leaf in jtu.tree_leaves(tree):
+        if eqx.is_array_like(leaf) or isinstance(leaf, Hashable):
+            continue
+        kind = type(leaf).__name__
+        raise TypeError(
+            f"`{name}` has a {kind}, into which JAX cannot look. Make {kind} an `equinox.Module` or a `typing.NamedTuple`, "
+            f"or register it: `@jax.tree_util.register_dataclass` above `@dataclasses.dataclass`."
+        )
+    return tree
+
+
+def with_arrays(tree: Any) -> Any:
+    """`tree` with an array in place of every real or complex number of Python."""
+    is_number = lambda x: type(x) in (float, complex)
+    return jtu.tree_map(lambda x: _as_array(x) if is_number(x) else x, tree)
+
+
+def _time_as_array(t: Any) -> Any:
+    return _as_array(float(t)) if type(t) in (int, float) else t
+
+
+def _as_array(number: float | complex) -> Any:
+    """The number itself under `jax.jit`, as it is part of that program anyway, and constants make a
+    better one."""
+    array = jnp.asarray(number)
+    return number if isinstance(array, jax.core.Tracer) else array

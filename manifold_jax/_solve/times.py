@@ -1,0 +1,112 @@
+"""Times that are no times: NaN is neither before nor after anything, and would end a solve at once."""
+
+import functools
+import inspect
+from collections.abc import Callable
+from typing import Any, cast, NamedTuple, TypeVar
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.core
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from diffrax import RESULTS
+
+from .._custom_types import BoolScalar, IntScalar, RealScalarLike
+
+
+Function = TypeVar("Function", bound=Callable)
+
+WRONG_SIGN = "`dt0` must have the sign of t1 - t0: it is the first step on the way from t0 to t1."
+NO_FIRST_STEP = (
+    "`dt0` is zero, NaN or infinite: it must be the length of the first step, with the sign of t1 - t0. With an "
+    "adaptive `stepsize_controller` it may be None."
+)
+NO_OUTPUT_TIME = "`saveat.ts` has times that are NaN. Save at numbers between t0 and t1."
+_NO_START = "`t0` is NaN or infinite: it must be a number."
+_NO_END = "`t1` is NaN: it must be a number, or infinite if an event ends the solve."
+
+
+def checking_first_step(function: Function) -> Function:
+    """Around a solve whose numbers become arrays: refuse a first step that is known to be none."""
+    place = list(inspect.signature(function).parameters).index("dt0")
+
+    @functools.wraps(function)
+    def solve(*args: Any, **kwargs: Any) -> Any:
+        __tracebackhide__ = True
+        dt0 = args[place] if len(args) > place else kwargs.get("dt0")
+        if isinstance(dt0, int | float) and not 0 < abs(dt0) < float("inf"):
+            raise ValueError(
+                f"`dt0` must be the length of the first step, with the sign of t1 - t0, got {dt0}. With an adaptive "
+                "`stepsize_controller` it may be None."
+            )
+        return function(*args, **kwargs)
+
+    return cast(Function, solve)
+
+
+def is_time_missing(t0: RealScalarLike, t1: RealScalarLike) -> BoolScalar:
+    return ~jnp.isfinite(t0) | jnp.isnan(t1)
+
+
+def is_no_step(dt0: RealScalarLike) -> BoolScalar:
+    return ~jnp.isfinite(dt0) | (jnp.asarray(dt0) == 0)
+
+
+class _Faults(NamedTuple):
+    """Of the times of a solve: whether there are any, which one to name, and what to say of each."""
+
+    any: BoolScalar
+    number: IntScalar
+    messages: list[str]
+
+    @staticmethod
+    def of(t0: Any, t1: Any, dt0: Any, saveat: dfx.SaveAt) -> "_Faults":
+        subs = jtu.tree_leaves(saveat.subs, is_leaf=lambda x: isinstance(x, dfx.SubSaveAt))
+        found = [(jnp.any(jnp.isnan(s.ts)), NO_OUTPUT_TIME) for s in subs if s.ts is not None]
+        if dt0 is not None:
+            found.append((is_no_step(dt0), NO_FIRST_STEP))
+        found += [(jnp.isnan(t1), _NO_END), (~jnp.isfinite(t0), _NO_START)]
+        number, applies = jnp.zeros((), jnp.int32), [fault for fault, _ in found]
+        for i, fault in enumerate(applies):
+            number = jnp.where(fault, i, number)
+        return _Faults(
+            functools.reduce(jnp.logical_or, applies), number, [text for _, text in found]
+        )
+
+
+def _attach(t0: Any, fault: BoolScalar, number: Any, messages: list[str]) -> Any:
+    """An error to a time, which stays a number where it is known that there is none."""
+    if not isinstance(fault, jax.core.Tracer) and not bool(fault):
+        return t0
+    return eqx.branched_error_if(jnp.asarray(t0), fault, number, messages)
+
+
+def refusing_missing_times(function: Function) -> Function:
+    """Around a solve: with `throw` an error that names the time at fault, otherwise the result code
+    `RESULTS.nonfinite_input`. Times that are known while tracing are looked at there, and cost nothing."""
+    signature = inspect.signature(function)
+
+    @functools.wraps(function)
+    def solve(*args: Any, **kwargs: Any) -> dfx.Solution:
+        __tracebackhide__ = True
+        bound = signature.bind(*args, **kwargs)
+        bound.apply_defaults()
+        given = bound.arguments
+        t0, t1, dt0, saveat, throw = (given[x] for x in ("t0", "t1", "dt0", "saveat", "throw"))
+        if not isinstance(saveat, dfx.SaveAt):  # refused by the function itself
+            return function(*args, **kwargs)
+        with jax.ensure_compile_time_eval(), jax.numpy_dtype_promotion("standard"):
+            faults = _Faults.of(t0, t1, dt0, saveat)
+            astray = jnp.asarray(False if dt0 is None else (jnp.asarray(t1) - t0) * dt0 < 0)
+        given["t0"] = _attach(t0, astray, 0, [WRONG_SIGN])
+        if throw:
+            given["t0"] = _attach(given["t0"], *faults)
+        sol = function(*bound.args, **bound.kwargs)
+        if throw:
+            return sol
+        result = RESULTS.where(faults.any, RESULTS.nonfinite_input, sol.result)  # pyright: ignore[reportArgumentType]
+        return eqx.tree_at(lambda s: s.result, sol, result)
+
+    return cast(Function, solve)
