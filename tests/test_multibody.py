@@ -394,6 +394,31 @@ def test_assembling_keeps_what_is_given():
     assert max(np.abs(leaf).max() for leaf in jax.tree.leaves(residual)) < 1e-14
 
 
+def test_assembling_inside_of_jit():
+    """Lengths and what is given may be traced: the state is the same, and its derivatives, in both modes and
+    twice, are those of finite differences."""
+    args = mj.problems.four_bar().args
+
+    def state(s):
+        longer = args.lengths * (1 + s * jnp.array([0.1, 0.2, 0.3, 0.1]))
+        robot = cases.four_bar(args._replace(lengths=longer))
+        given = {"crank": 0.9 + 0.3 * s}, None, {"crank": 6.0 + s}
+        return robot.state(None, *given, assemble=True)
+
+    eager, traced = state(0.0), jax.jit(state)(0.0)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-12), eager, traced)
+    assert traced[0].orientation[0] == 0.9  # what is given stays what it is
+    assert traced[1].orientation[0] == 6.0
+    total = lambda s: sum(jnp.sum(jnp.sin(x)) for x in jax.tree.leaves(state(s)))
+    batch = jax.jit(jax.vmap(total))(jnp.array([-2e-4, -1e-4, 0.0, 1e-4, 2e-4]))
+    slope = (8 * (batch[3] - batch[1]) - (batch[4] - batch[0])) / 12e-4
+    for derivative in (jax.grad(total), jax.jacfwd(total)):
+        np.testing.assert_allclose(jax.jit(derivative)(0.0), slope, rtol=1e-9)
+    h, reverse = 1e-4, jax.jit(jax.grad(total))
+    bend = (8 * (reverse(h) - reverse(-h)) - (reverse(2 * h) - reverse(-2 * h))) / (12 * h)
+    np.testing.assert_allclose(jax.jit(jax.jacfwd(jax.grad(total)))(0.0), bend, rtol=1e-8)
+
+
 def test_states_that_are_refused():
     problem = mj.problems.four_bar()
     robot = cases.four_bar(problem.args)
@@ -412,8 +437,11 @@ def test_states_that_are_refused():
         robot.state({"ground": (0, 0)})
     with pytest.raises(ValueError, match=r"`positions` of 'crank' must be of shape \(2,\)"):
         robot.state({"crank": (0, 0, 0)})
-    with pytest.raises(ValueError, match="for concrete numbers"):
-        jax.jit(lambda x: robot.state(None, {"crank": x}, assemble=True))(1.0)
+    too_far = jax.jit(
+        lambda x: cases.four_bar(problem.args._replace(lengths=x)).state(assemble=True)
+    )
+    with pytest.raises(Exception, match="joints cannot be closed, .* least of all"):
+        too_far(jnp.asarray([1.0, 1.0, 1.0, 10.0]))
 
 
 def test_a_fixed_pose_is_not_moved():

@@ -122,8 +122,9 @@ class Assembly(eqx.Module):
             `angular_velocities` (rad/s), a number, or in space shape `(3,)`, in the coordinates of
             space.
         - `assemble`: keep what is given, and find the rest such that all joints are satisfied, the
-            nearest to the drawing and the slowest. For concrete numbers only; traced states are
-            moved onto the manifold by [`consistent_state`][].
+            nearest to the drawing and the slowest. Also inside of `jit`, `vmap` and derivatives, by
+            lengths and by what is given; joints that cannot be closed are then an error while the
+            program runs. (Without it traced states are not checked.)
         - `t`, `args`: the time of the start and the `args` of the solve, for what [`Drive`][]s prescribe.
 
         **Raises** `ValueError` where joints are not satisfied (without `assemble`) or cannot be:

@@ -18,6 +18,7 @@ from .._custom_types import Args
 from .bodies import check_orientation, Pose
 from .checks import check_number, check_vector, is_concrete, stack
 from .rotations import rates_matrix, rotation_matrix
+from .traced_start import assemble_traced
 
 
 # Joints count as closed below this gap (m, or the cosine of an angle), or this many units of rounding.
@@ -42,12 +43,12 @@ def make_state(
 ) -> tuple[Pose, Pose]:
     y, fixed = _with_given(assembly, given)
     if not all(is_concrete(leaf) for leaf in jtu.tree_leaves((y, assembly, t, args))):
-        if assemble:
-            raise ValueError(
-                "`assemble=True` is for concrete numbers. Of traced ones build the state without it and move it onto the "
-                "manifold by `mj.consistent_state(system.constraint, t, y)`."
-            )
-        return y
+        if not assemble:
+            return y
+        names = _named_rows(assembly, t, args)
+        eps = float(jnp.finfo(y[0].position.dtype).eps)
+        closed = max(CLOSED, ROUNDING * eps)
+        return assemble_traced(assembly, y, fixed, t, args, names, ITERATIONS, closed)
     find = _Host(assembly, y, fixed, t, args)
     if assemble:
         y = find.assembled(y)
@@ -160,23 +161,11 @@ class _Host:
             )
 
     def _worst(self, size: np.ndarray, most: float, unit: str) -> str:
-        largest = [size[rows].max() for _, rows in self._rows()]
+        named = _named_rows(self.assembly, *self.at)
+        largest = [size[rows].max() for _, rows in named]
         order = np.argsort(largest)[::-1][:5]
-        worst = [(self._rows()[i][0], largest[i]) for i in order if not largest[i] <= most]
+        worst = [(named[i][0], largest[i]) for i in order if not largest[i] <= most]
         return ", ".join(f"{name} (gap {gap:.3g} {unit})" for name, gap in worst)
-
-    def _rows(self) -> list[tuple[str, np.ndarray]]:
-        """The rows of every joint among the equations."""
-        named, start = [], 0
-        t, args = self.at
-        still_there = self.assembly._equations(t, self.assembly.bodies.drawing, args)
-        for group, part in zip(self.assembly.joints, still_there, strict=False):
-            rows = start + np.arange(part.size).reshape(part.shape)
-            named += list(zip(group.attachment.names, rows, strict=True))
-            start += part.size
-        norms = self.assembly.bodies.names if not self.assembly.bodies.planar else ()
-        named += [(f"norm of {name!r}", np.array([start + i])) for i, name in enumerate(norms)]
-        return named
 
     def _check_rank(self, J: np.ndarray) -> None:
         J = J / np.maximum(np.linalg.norm(J, axis=1, keepdims=True), np.finfo(J.dtype).tiny)
@@ -185,9 +174,23 @@ class _Host:
         if rank == J.shape[0]:
             return
         among = np.abs(left[:, rank:]).max(axis=1)
-        names = [name for name, rows in self._rows() if among[rows].max() > 1e-6]
+        named = _named_rows(self.assembly, *self.at)
+        names = [name for name, rows in named if among[rows].max() > 1e-6]
         raise ValueError(
             f"{J.shape[0] - rank} of the {J.shape[0]} equations of the joints depend on others in this pose, among those of "
             f"{', '.join(names[:10])}{', ...' if len(names) > 10 else ''}. If they do so in every pose (closed loops), "
             "write `Assembly(..., redundant=True)`; if in this one alone, start beside it."
         )
+
+
+def _named_rows(assembly: Any, t: Array, args: Args) -> list[tuple[str, np.ndarray]]:
+    """The rows of every joint among the equations."""
+    named, start = [], 0
+    at_drawing = lambda: assembly._equations(t, assembly.bodies.drawing, args)
+    for group, part in zip(assembly.joints, jax.eval_shape(at_drawing), strict=False):
+        rows = start + np.arange(part.size).reshape(part.shape)
+        named += list(zip(group.attachment.names, rows, strict=True))
+        start += part.size
+    norms = assembly.bodies.names if not assembly.bodies.planar else ()
+    named += [(f"norm of {name!r}", np.array([start + i])) for i, name in enumerate(norms)]
+    return named
