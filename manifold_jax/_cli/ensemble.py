@@ -74,7 +74,8 @@ def ensemble(
     varied = VariedProblem(task.problem, drawn)
     begun = time.perf_counter()
     try:
-        before = open_ensemble(out).finished if resume and (out / "zarr.json").exists() else 0
+        is_there = resume and (out / "zarr.json").exists()
+        before = open_ensemble(out, check=False).finished if is_there else 0
         stored = stream_ensemble(
             varied.sample,
             size,

@@ -21,18 +21,19 @@ from .sampling import drawn
 from .settings import check_settings, settings_of
 from .solution import messages_of
 from .solve_ensemble import solve_ensemble
-from .store import (
+from .store import stored_at, StoredEnsemble
+from .store_arrays import (
     clear_partial,
     clear_write_errors,
-    created,
-    ensure_arrays,
+    create_arrays,
+    create_group,
     is_partial,
     named,
-    stored_at,
-    StoredEnsemble,
     write,
     zarr,
 )
+from .store_faults import faults_of_chunks, faults_of_descriptions, finished_chunks
+from .store_lock import LOCK_FILE, only_writer
 
 
 # Numbers of trajectories are 32-bit integers where JAX has no others.
@@ -95,8 +96,9 @@ def stream_ensemble(
     - `chunk`: how many trajectories are solved and written together. Much larger than `lanes`, as
         lanes run empty at the end of each chunk.
     - `seed`: of the random numbers.
-    - `resume`: continue what is in `out`, or begin if there is nothing. Refused if the settings
-        stored there differ, `terms`, constraint and `sample` included.
+    - `resume`: continue what is in `out`, or begin if there is nothing. Chunks that are missing or
+        damaged are computed again. Refused if the settings stored there differ, `terms`, constraint
+        and `sample` included, but for what a `jax.pure_callback` calls, which cannot be seen.
     - `progress`: show how far it is, trajectories per second, and how many have failed.
 
     **Returns:**
@@ -106,8 +108,8 @@ def stream_ensemble(
 
     **Raises:**
 
-    As `solve_ensemble`; `FileExistsError` for a folder that is not empty, `OSError` if it cannot be
-    written to, `ValueError` for other settings, `ImportError` without zarr
+    As `solve_ensemble`; `FileExistsError` for a folder that is not empty, `BlockingIOError` for one that
+    another process is writing, `OSError` if it cannot be written to, `ValueError` for other settings, `ImportError` without zarr
     (`pip install "manifold_jax[ensemble]"`).
     """
     zarr()
@@ -128,20 +130,33 @@ def stream_ensemble(
     named(examples)  # refuses names before anything is written
     lowered = _solve_chunk.lower(*call(0))
     settings = {"size": size, "chunk": chunk, "seed": int(seed), **parts, **options}
-    stored = _opened(out, settings_of(settings, lowered.as_text()), messages_of(solver), resume)
-    ensure_arrays(stored, examples)
-    finished, failed = stored.finished, stored.num_failed
-    with Meter(size, finished, failed, progress) as meter:
-        if finished < size:
+    described = settings_of(settings, lowered.as_text()) | {"checksums": "crc32c"}
+    with clear_write_errors(out):
+        out.mkdir(parents=True, exist_ok=True)
+    with only_writer(out):
+        stored = _opened(out, described, messages_of(solver), examples, resume)
+        _compute(stored, lowered, call, progress)
+    return stored
+
+
+def _compute(stored: StoredEnsemble, lowered: Any, call: Callable, progress: bool) -> None:
+    """The chunks that are not there, or not as they were written."""
+    size, chunk = stored.size, stored.chunk
+    damaged = {fault.chunk for fault in faults_of_chunks(stored.group)}
+    whole = [k for k in finished_chunks(stored.group) if k not in damaged]
+    starts = [k * chunk for k in range(-(-size // chunk)) if k not in whole]
+    count = lambda start: min(chunk, size - start)
+    finished = size - sum(map(count, starts))
+    failed = sum(np.count_nonzero(stored.result[k * chunk : (k + 1) * chunk]) for k in whole)
+    with Meter(size, finished, int(failed), progress) as meter:
+        if starts:
             meter.compiling()
             program = lowered.compile()
             meter.begin()
-        for start in range(finished, size, chunk):
+        for start in starts:
             values = program(*call(start))
-            write(stored, start, values)
-            count = min(chunk, size - start)
-            meter.advance(count, int(np.count_nonzero(values["result"][:count])))
-    return stored
+            write(stored.group, start, values)
+            meter.advance(count(start), int(np.count_nonzero(values["result"][: count(start)])))
 
 
 @eqx.filter_jit
@@ -171,14 +186,13 @@ def _solve_chunk(
 
 
 def _opened(
-    out: Path, settings: dict[str, Any], messages: Sequence[str], resume: bool
+    out: Path, settings: dict[str, Any], messages: Sequence[str], examples: Any, resume: bool
 ) -> StoredEnsemble:
-    """The folder, new or as it is, with those settings."""
+    """The folder, new or as it is, with those settings and all of its arrays."""
     with clear_write_errors(out):
-        out.mkdir(parents=True, exist_ok=True)
-        is_empty = all(resume and is_partial(file) for file in out.iterdir())
-    if is_empty:
-        stored = created(out, settings, messages)
+        files = [file for file in out.iterdir() if file.name != LOCK_FILE]
+    if all(resume and is_partial(file) for file in files):
+        stored = StoredEnsemble(create_group(out, settings, messages, examples))
     elif not resume:
         raise FileExistsError(
             errno.EEXIST,
@@ -192,6 +206,10 @@ def _opened(
             )
         check_settings(out, stored.settings, settings)
     clear_partial(out)
+    with clear_write_errors(out):
+        for fault in faults_of_descriptions(out, dict(stored.group.attrs)):
+            (out / fault.file).unlink(missing_ok=True)
+        create_arrays(stored.group, stored.size, stored.chunk, examples)
     return stored
 
 
