@@ -17,7 +17,9 @@ FILES = sorted(PACKAGE.rglob("*.py"))
 LAYERS = [
     {
         "_custom_types",
+        "_closure",
         "_compat",
+        "_derivative_rule",
         "_errors",
         "_extras",
         "_numbers",

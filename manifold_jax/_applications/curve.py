@@ -63,7 +63,7 @@ class CurveTrace(eqx.Module):
 
 
 @clear_errors
-@numbers_as_arrays("x0", "args", times=("length",))
+@numbers_as_arrays("x0", "args")
 @eqx.filter_jit
 def trace_curve(
     function: Callable[[Float[Array, " k"], Args], Float[Array, " n"]],
