@@ -21,7 +21,7 @@ class ConvertedClosure(eqx.Module):
     def __call__(self, *args: Any) -> Any:
         arrays, static = eqx.partition(args, eqx.is_array)
         leaves, treedef = jtu.tree_flatten(arrays)
-        kinds = [(jnp.shape(v.aval), v.aval.dtype) for v in self.jaxpr.invars]  # pyright: ignore[reportAttributeAccessIssue]
+        kinds = [(v.aval.shape, v.aval.dtype) for v in self.jaxpr.invars]  # pyright: ignore[reportAttributeAccessIssue]
         given = [(x.shape, x.dtype) for x in leaves]
         if (treedef, static) != self.inputs or given != kinds:
             raise ValueError(

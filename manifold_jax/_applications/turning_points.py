@@ -56,13 +56,13 @@ def find_turns(
         fixed = without_derivative((curve, path))
         root = _bracketed_root(lambda s: slope(*fixed, s), ends, (slopes[step], slopes[step + 1]))  # pyright: ignore[reportArgumentType, reportCallIssue]
 
-        def step(s):
+        def newton(s):
             at = lambda s: slope(curve, path, s)
             value, rate = jax.jvp(at, (s,), (jnp.ones_like(s),))
             return -jnp.where(found, value / jnp.where(found, rate, 1), 0)
 
         root = jax.lax.stop_gradient(root)
-        s = root_of_step(convert_closure(step, root), root)
+        s = root_of_step(convert_closure(newton, root), root)
         return s, path.evaluate(s)
 
     return Turns(count, found, *jax.vmap(locate)(before, found))

@@ -101,14 +101,17 @@ def diffeqsolve(
     `TypeError` or `ValueError` for arguments that cannot work. With `throw=True` a
     `RuntimeError` where the solve fails; with `throw=False` look at `sol.result`:
     `RESULTS.nonlinear_divergence` is a constraint that could not be satisfied, or is NaN where it is
-    evaluated, `RESULTS.nonfinite_input` a time that is NaN, and `RESULTS.nonfinite` a state that is NaN or infinite otherwise, with a constant step
-    size also for a solver of Diffrax alone.
+    evaluated, `RESULTS.nonfinite_input` a time that is NaN, and `RESULTS.nonfinite` a state that is NaN or
+    infinite otherwise, with a constant step size also for a solver of Diffrax alone.
 
     Source: Sudarsan & Keerthi, Appl. Math. Comput. 92 (1998) 153-193.
     """
     check_arguments(terms, solver, dt0, saveat, stepsize_controller, adjoint, event, consistent)
     check_max_steps(max_steps)
     warn_of_rounding(y0, time_dtype(t0, t1, dt0, saveat), stepsize_controller)
+    given: Any = solver
+    if isinstance(solver, AbstractManifoldSolver):
+        terms, solver = evaluated((terms, solver), args)
     solver = without_idle_hook(solver, t0, y0, args)
     adjoint = CheckedStartAdjoint(adjoint)
     if event is not None and event.root_finder is not None:
@@ -139,11 +142,9 @@ def diffeqsolve(
             solver_state=solver_state,
             **options,
         )
-    given = solver
-    terms, inside = evaluated((terms, solver), args)
     bends_interpolant = event is not None  # every interpolated value is corrected otherwise
     hook: AbstractManifoldSolver = trusting(
-        inside.within(stepsize_controller, bends_interpolant), consistent
+        solver.within(stepsize_controller, bends_interpolant), consistent
     )
     ready = prepare(
         terms, hook, t0, t1, dt0, y0, args, saveat, stepsize_controller, consistent, throw
