@@ -33,10 +33,10 @@ def check_first_solve(namespace):
 def check_mechanism(namespace):
     q = np.asarray(namespace["motion"].ys[0][-1])
     np.testing.assert_allclose(np.linalg.norm([q[0], q[1] - q[0]], axis=1), 1, atol=1e-15)
-    rods, end, multipliers = (namespace[name] for name in ("rods", "end", "multipliers"))
-    jacobian = jax.jacobian(lambda q: rods(5.0, q, None))(end[0])
+    rods, final, multipliers = (namespace[name] for name in ("rods", "final", "multipliers"))
+    jacobian = jax.jacobian(lambda q: rods(5.0, q, None))(final[0])
     pull = -jnp.einsum("i,ijk->jk", multipliers, jacobian)
-    accelerations = namespace["system"].accelerations(5.0, end)
+    accelerations = namespace["system"].accelerations(5.0, final)
     expected = jnp.array([[0.0, -9.81], [0.0, -9.81]]) + pull
     np.testing.assert_allclose(accelerations, expected, rtol=0, atol=1e-12)
 
