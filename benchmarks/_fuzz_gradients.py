@@ -27,6 +27,8 @@ from ._fuzz_structure import IMPLICIT, SPLIT, Structure
 # Lanes of which gradients are taken.
 COUNT = 6
 REVERSE_LIMIT = 1e-9
+# Of second derivatives, which amplify more.
+SECOND_LIMIT = 1e-7
 ADJOINTS = {
     "default": mj.StepReplayAdjoint,
     "few states": functools.partial(mj.StepReplayAdjoint, checkpoints=4),
@@ -60,6 +62,8 @@ def check_gradients(
         text = f"reverse and forward mode differ by {ways:.1e}"
         faults.append(Fault("gradient", text))
     numbers = {"reverse": float(ways)}
+    if structure.reverse in (None, "default"):
+        faults += _check_second(structure, lanes, directions, trusted, numbers)
     expected, bound = _expected(structure, lanes, directions, judge)
     if expected is not None:
         error = np.abs(slope - expected) / scale
@@ -69,6 +73,34 @@ def check_gradients(
             text = f"{slope[wrong[0]]:.6g} by forward mode, {expected[wrong[0]]:.6g} by differences"
             faults.append(Fault("gradient", f"{text}, lane {wrong[0]}"))
     return faults, numbers
+
+
+def _check_second(
+    structure: Structure, lanes: Lanes, directions: Args, trusted: np.ndarray, numbers: dict
+) -> list[Fault]:
+    """Second derivatives, forward over forward mode against forward over reverse mode."""
+    reverse = _reverse(structure)
+    backward = jax.jit(jax.vmap(_along(lambda lane, along: reverse(lane, along)[0])))
+    forward = jax.jit(jax.vmap(_along(_forward(structure))))
+    one, other = (np.asarray(f(lanes, directions))[trusted] for f in (forward, backward))
+    if not np.all(np.isfinite(one)) or not np.all(np.isfinite(other)):
+        return [Fault("gradient", "second derivatives are not finite")]
+    ways = np.max(np.abs(one - other) / np.maximum(np.abs(one), 1.0), initial=0.0)
+    numbers["second"] = float(ways)
+    if ways <= SECOND_LIMIT:
+        return []
+    return [Fault("gradient", f"second derivatives in two orders of modes differ by {ways:.1e}")]
+
+
+def _along(slope: Any) -> Any:
+    """The derivative of a slope along the same direction."""
+
+    def second(lane, direction):
+        chosen = {name: lane["args"][name] for name in direction}
+        at = lambda parameters: slope(_with(lane, parameters), direction)
+        return jax.jvp(at, (chosen,), (direction,))[1]
+
+    return second
 
 
 def _raises_upstream(structure: Structure) -> bool:

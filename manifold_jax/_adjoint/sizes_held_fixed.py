@@ -1,11 +1,13 @@
 """Forward mode of a solve with the steps that were made, as reverse mode has it: where steps end is
 held fixed, but for the end of the solve."""
 
+from collections.abc import Callable
 from typing import Any
 
 import diffrax as dfx
 import jax.lax as lax
 import jax.numpy as jnp
+import jax.tree_util as jtu
 
 from .._compat import LoopState, Progress, with_next_time
 from .._newton import without_derivative
@@ -34,3 +36,20 @@ def with_end_held_fixed(state: LoopState, t1: Any) -> LoopState:
     """The first step ends where it does, unless that is the end of the solve."""
     tnext = Progress.of(state).tnext
     return with_next_time(state, jnp.where(tnext == t1, t1, lax.stop_gradient(tnext)))
+
+
+def event_of_controller(
+    event: dfx.Event | None, controller: dfx.AbstractStepSizeController
+) -> dfx.Event | None:
+    """The event with the controller that was given, whose tolerances Diffrax's own event functions ask
+    for, in the place of the one that is wrapped around it."""
+    if event is None:
+        return None
+
+    def wrap(cond_fn: Callable) -> Callable:
+        return lambda *args, **kwargs: cond_fn(
+            *args, **{**kwargs, "stepsize_controller": controller}
+        )
+
+    cond_fn = jtu.tree_map(wrap, event.cond_fn, is_leaf=callable)
+    return dfx.Event(cond_fn, event.root_finder, event.direction)

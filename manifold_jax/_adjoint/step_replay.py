@@ -23,7 +23,7 @@ from .handed_out import HandedOut
 from .record import Record, recording
 from .replay import Replay, Solve
 from .saved import Functions, Rows, SavedValues
-from .sizes_held_fixed import SizesHeldFixed, with_end_held_fixed
+from .sizes_held_fixed import event_of_controller, SizesHeldFixed, with_end_held_fixed
 
 
 class StepReplayAdjoint(dfx.AbstractAdjoint):
@@ -111,7 +111,7 @@ class StepReplayAdjoint(dfx.AbstractAdjoint):
             return diffrax_loop(
                 solver=_with_loops(solver, "lax"),
                 stepsize_controller=SizesHeldFixed(stepsize_controller),
-                event=event,
+                event=event_of_controller(event, stepsize_controller),
                 saveat=saveat,
                 t0=t0,
                 t1=t1,
