@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 import pytest
-from jax.sharding import Mesh
+from jax.sharding import Mesh, PartitionSpec
 
 import manifold_jax as mj
 
@@ -119,3 +119,31 @@ def collectives(program):
     found = {name: COLLECTIVE.findall("\n".join(lines)) for name, lines in blocks.items()}
     listed = lambda names: [x for name in names for x in found[name]]
     return listed(found), listed(inside)
+
+
+HOOKS = {
+    "none": dfx.Tsit5(),
+    "projected": mj.Projected(dfx.Tsit5(), CIRCLE.constraint),
+    "local": mj.LocalCoordinates(dfx.Tsit5(), CIRCLE.constraint),
+}
+
+
+@pytest.mark.parametrize("name", HOOKS)
+def test_solves_in_mapped_functions(devices, name):
+    """`jax.pmap` and `jax.shard_map` with what is not mapped beside what is: start and times."""
+
+    def end(rate):
+        saveat = dfx.SaveAt(ts=jnp.array([0.3, 1.0]))
+        args = rate, SHIFT
+        sol = mj.diffeqsolve(TURN, HOOKS[name], 0.0, 1.0, 0.1, start, args, saveat=saveat)
+        return jnp.sum(sol.ys[:, 0])
+
+    start, rates, both = STARTS[0], RATES[:2], jax.value_and_grad(end)
+    single = [both(rate) for rate in rates]
+    spec = PartitionSpec("x")
+    sharded = jax.shard_map(
+        jax.vmap(both), mesh=Mesh(devices, ("x",)), in_specs=spec, out_specs=spec, check_vma=False
+    )
+    for values, slopes in (jax.pmap(both)(rates), jax.jit(sharded)(rates)):
+        np.testing.assert_allclose(values, [v for v, _ in single], rtol=1e-14)
+        np.testing.assert_allclose(slopes, [s for _, s in single], rtol=1e-12)
