@@ -233,7 +233,7 @@ def equations_of(
     residual = convert_closure(
         lambda t, x, args: residual_vector(function, t, unravel(x), args), t, x, args
     )
-    metric = projection.inverse_metric(y)
+    metric = projection.inverse_metric_without_masses(y)
     return CorrectionEquations(residual, t, x, args, metric, directions, redundant, structure)
 
 

@@ -35,8 +35,10 @@ class NewtonProjection(eqx.Module):
 
     **Arguments:**
 
-    - `metric`: the norm in which the correction is orthogonal. `None` is the identity, and
-        the mass matrix for the constraint of a [`MechanicalSystem`][]; `"identity"` in any case; `"error"` for
+    - `metric`: the norm in which the correction is orthogonal. `None` is the identity, or
+        `"error"` with an `atol` below the rounding of a number of size one, which says that components far
+        smaller count, too; and the mass matrix for the constraint of a [`MechanicalSystem`][].
+        `"identity"` in any case; `"error"` for
         the norm of the step size controller, `w_j = 1 / (atol + rtol |y_j|)^2`; or a pytree
         like `y` of positive weights `w_j`, large for components that should stay put.
     - `max_steps`: the most Newton iterations before the projection fails. 1 is a method of
@@ -113,6 +115,15 @@ class NewtonProjection(eqx.Module):
 
         return 1 / jfu.ravel_pytree(jtu.tree_map(spread, self.metric, y))[0]
 
+    def inverse_metric_without_masses(self, y: Y) -> Float[Array, " n"] | None:
+        """The same where `None` is not the masses. In the identity a correction of rounding size of a
+        large component moves a small one by as much: Robertson's reaction to 1e11 with `atol=1e-14` has
+        then 6.0 digits instead of 7.2, and makes 857 steps instead of 655."""
+        known = all(isinstance(x, int | float) for x in (self.rtol, self.atol))
+        if self.metric is None and known and self.atol < _SMALLEST * _rounding(y):  # pyright: ignore[reportOperatorIssue]
+            return self._error_weights(y)
+        return self.inverse_metric(y)
+
     def _error_weights(self, y: Y) -> Float[Array, " n"]:
         if self.rtol is None or self.atol is None:
             raise ValueError(
@@ -120,6 +131,14 @@ class NewtonProjection(eqx.Module):
                 "adaptive controller, or pass `NewtonProjection(metric='error', rtol=..., atol=...)`."
             )
         return (self.atol + self.rtol * jnp.abs(jfu.ravel_pytree(y)[0])) ** 2
+
+
+# Units of rounding.
+_SMALLEST = 100
+
+
+def _rounding(y: Y) -> float:
+    return float(jnp.finfo(jnp.result_type(*jtu.tree_leaves(y))).eps)
 
 
 def _may_be_positive(number: Any) -> bool:
