@@ -148,3 +148,15 @@ def test_lanes_of_a_batch_are_independent():
     assert more[1] > rejected[1]
     np.testing.assert_array_equal(disturbed[0], quiet[0])
     assert np.abs(disturbed[1] - quiet[1]).max() > 1e-6
+
+
+def test_small_components_count_where_the_tolerance_says_so():
+    """In the plain norm each correction of the sum by its rounding moves the smallest component by a
+    thousandth of itself."""
+    digits, steps, _ = digits_and_steps(mj.Rodas5P())
+    projected, more, violation = digits_and_steps(mj.Projected(mj.Rodas5P(), MASS))
+    assert projected > digits - 0.1
+    assert more <= 1.1 * steps
+    assert abs(violation) < 3e-16
+    plain = mj.NewtonProjection(metric="identity")
+    assert digits_and_steps(mj.Projected(mj.Rodas5P(), MASS, projection=plain))[0] < 6.5
