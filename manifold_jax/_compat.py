@@ -17,6 +17,9 @@ from diffrax._integrate import (
     SaveState as SaveState,  # what has been saved so far
     State as LoopState,  # what a solve carries from step to step
 )
+from diffrax._root_finder import (
+    use_stepsize_tol as use_stepsize_tol,  # marks tolerances that are to be those of the steps
+)
 from diffrax._saveat import save_y as save_y  # marks "save the state itself" in SubSaveAt.fn
 from diffrax._solution import (
     is_okay as is_okay,  # successful or stopped by an event

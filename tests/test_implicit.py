@@ -160,3 +160,21 @@ def test_small_components_count_where_the_tolerance_says_so():
     assert abs(violation) < 3e-16
     plain = mj.NewtonProjection(metric="identity")
     assert digits_and_steps(mj.Projected(mj.Rodas5P(), MASS, projection=plain))[0] < 6.5
+
+
+SPIN = lambda t, y, a: jnp.stack([1.2 * y[1] * y[2], -1.1 * y[0] * y[2], -0.1 * y[0] * y[1]])
+SPUN = jnp.array([0.6, 0.48, 0.64])
+
+
+@pytest.mark.parametrize("solver", [dfx.Kvaerno3(), dfx.ImplicitEuler()], ids=["3", "1"])
+@pytest.mark.parametrize("hook", [False, True])
+def test_constant_steps_need_no_tolerances(solver, hook):
+    """Stages are solved to round-off in any case, and the order is that of the method."""
+    sphere = mj.Constraint(lambda t, y, args: y @ y - 1)
+    used = mj.Projected(solver, sphere) if hook else solver
+    end = jax.jit(lambda h: mj.diffeqsolve(dfx.ODETerm(SPIN), used, 0.0, 2.0, h, SPUN).ys[0])
+    tight = dfx.PIDController(rtol=1e-12, atol=1e-12)
+    options = dict(stepsize_controller=tight, max_steps=10**5)
+    exact = mj.diffeqsolve(dfx.ODETerm(SPIN), dfx.Dopri8(), 0.0, 2.0, None, SPUN, **options).ys[0]
+    errors = [np.abs(end(2.0 / n) - exact).max() for n in (40, 80)]
+    assert abs(np.log2(errors[0] / errors[1]) - solver.order(None)) < 0.2

@@ -11,6 +11,7 @@ from .._errors import clear_errors
 from .._numbers import numbers_as_arrays
 from .._of_args import evaluated
 from .._solver.base import AbstractManifoldSolver
+from .._solver.implicit import with_tolerances_of_stages
 from .arguments import (
     check_arguments,
     check_max_steps,
@@ -146,6 +147,7 @@ def diffeqsolve(
     hook: AbstractManifoldSolver = trusting(
         solver.within(stepsize_controller, bends_interpolant), consistent
     )
+    hook = with_tolerances_of_stages(hook, stepsize_controller, y0)
     ready = prepare(
         terms, hook, t0, t1, dt0, y0, args, saveat, stepsize_controller, consistent, throw
     )

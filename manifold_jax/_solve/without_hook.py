@@ -11,7 +11,7 @@ import jax.tree_util as jtu
 from .._compat import is_okay, save_y, update_result
 from .._custom_types import Args, RealScalarLike, Y
 from .._rosenbrock import AbstractRosenbrock
-from .._solver.implicit import with_accurate_stages
+from .._solver.implicit import with_accurate_stages, with_tolerances_of_stages
 from .mass_matrix import consistent_with_mass, trusting
 from .outcome import raise_if_failed, result_of_saved
 from .prepare import as_state, chosen_first_step, time_dtype
@@ -35,6 +35,7 @@ def solve_without_hook(
     no success, and Rosenbrock methods get a consistent start and a first step."""
     _warn_of_unknown_hook(solver)
     solver, moved = with_accurate_stages(solver), None
+    solver = with_tolerances_of_stages(solver, options["stepsize_controller"], y0)
     if isinstance(solver, AbstractRosenbrock):
         dtype = time_dtype(t0, t1, dt0, saveat)
         y0, t0, t1 = as_state(y0, dtype), jnp.asarray(t0, dtype), jnp.asarray(t1, dtype)

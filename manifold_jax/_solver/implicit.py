@@ -4,10 +4,12 @@ from typing import Any
 
 import diffrax as dfx
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import optimistix as optx
 
+from .._compat import use_stepsize_tol
 from .._custom_types import Args, BoolScalar, FloatScalar, RealScalarLike, Y
 from .explicit import refreshed
 from .frame import Frame
@@ -90,6 +92,25 @@ def with_accurate_stages(solver: dfx.AbstractSolver) -> dfx.AbstractSolver:
     if isinstance(getattr(solver, "root_finder", None), dfx.VeryChord):
         return eqx.tree_at(lambda s: s.root_finder, solver, replace_fn=StageChord)  # pyright: ignore[reportArgumentType]
     return solver
+
+
+def with_tolerances_of_stages(
+    solver: dfx.AbstractSolver, controller: dfx.AbstractStepSizeController, y0: Y
+) -> dfx.AbstractSolver:
+    """With constant steps there are no tolerances of the steps that stages could inherit. They are
+    solved to round-off in any case, and count as solved where half of the digits are right."""
+    if isinstance(controller, dfx.AbstractAdaptiveStepSizeController):
+        return solver
+    finder = getattr(solver, "root_finder", None)
+    with jax.numpy_dtype_promotion("standard"):
+        dtype = jnp.result_type(float, *jtu.tree_leaves(y0))
+    half = float(jnp.finfo(dtype).eps) ** 0.5
+    values = {"rtol": half, "atol": half, "norm": optx.rms_norm}
+    names = [name for name in values if getattr(finder, name, None) is use_stepsize_tol]
+    if not names:
+        return solver
+    missing = lambda s: [getattr(s.root_finder, name) for name in names]
+    return eqx.tree_at(missing, solver, [values[name] for name in names])
 
 
 def carries_derivative(solver: dfx.AbstractSolver, terms: Any, t0, t1, y0: Y, args: Args) -> bool:
