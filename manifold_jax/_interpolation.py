@@ -1,5 +1,6 @@
 """Dense output: interpolants that end where the corrected steps do, and stay on the manifold."""
 
+import copy
 from collections.abc import Callable
 from typing import Any
 
@@ -122,6 +123,17 @@ class ManifoldInterpolation(dfx.AbstractPath):
         arrays, functions = eqx.partition(correct, is_array)
         leaves, tree = jtu.tree_flatten(functions)
         return ManifoldInterpolation(inner, arrays, (tuple(leaves), tree))
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> "ManifoldInterpolation":
+        """With arrays of its own; traced functions do not change."""
+        inner, arrays = copy.deepcopy((self.inner, self.arrays), memo)
+        return ManifoldInterpolation(inner, arrays, self.functions)
+
+    def __reduce__(self) -> Any:
+        raise TypeError(
+            "A dense solution on a manifold cannot be pickled, as it holds traced functions of the constraint. Save "
+            "values, `jax.vmap(sol.evaluate)(ts)`, or what it was solved from; `copy.deepcopy` works."
+        )
 
     @property
     def t0(self):  # pyright: ignore

@@ -117,3 +117,27 @@ def test_one_gradient_at_all_tolerances(hook):
 @pytest.mark.parametrize("hook", ["plain", "projected", "tangent"])
 def test_one_gradient_of_implicit_solvers(hook, solver):
     check(hook, solver, dfx.SaveAt(t1=True), 2.0, (1e-6, 1e-8, 1e-10))
+
+
+def test_an_ensemble_with_empty_arrays():
+    """In the state and in `args`; as one by one, with gradients."""
+    angles = jnp.array([0.1, 0.7, 1.3])
+    starts = jnp.stack([jnp.cos(angles), jnp.sin(angles)], axis=1), jnp.zeros((3, 0))
+    circle = mj.Projected(dfx.Tsit5(), mj.Constraint(lambda t, y, args: y[0] @ y[0] - 1))
+    turn = lambda t, y, args: (args[0] * jnp.stack([-y[0][1], y[0][0]]), y[1])
+    rates = jnp.array([1.0, 1.5, 2.0])
+
+    def ends(rates):
+        parts = dfx.ODETerm(turn), circle, 0.0, 1.0, 0.25, starts, (rates, jnp.zeros((3, 0)))
+        return mj.solve_ensemble(*parts, in_axes=0).ys
+
+    x, empty = ends(rates)
+    assert empty.shape[0] == 3
+    assert empty.size == 0
+    one = lambda y, rate: mj.diffeqsolve(
+        dfx.ODETerm(turn), circle, 0.0, 1.0, 0.25, y, (rate, jnp.zeros(0))
+    ).ys[0]
+    np.testing.assert_allclose(x, jax.vmap(one)(starts, rates), rtol=1e-14)
+    slope = jax.grad(lambda rates: jnp.sum(ends(rates)[0][..., 0]))(rates)
+    expected = jax.grad(lambda rates: jnp.sum(jax.vmap(one)(starts, rates)[..., 0]))(rates)
+    np.testing.assert_allclose(slope, expected, rtol=1e-12)

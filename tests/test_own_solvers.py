@@ -1,5 +1,8 @@
 """Solvers of the user's own: their steps are made as they are written, whatever their tableau."""
 
+import copy
+import pickle
+
 import diffrax as dfx
 import jax
 import jax.numpy as jnp
@@ -166,3 +169,13 @@ def test_a_hook_of_the_users_own():
         assert abs(solve(OwnHook(dfx.Tsit5())).ys[0] @ off - off @ off) < 1e-12
     ys = solve(mj.Projected(OwnHook(dfx.Tsit5()), CIRCLE)).ys
     np.testing.assert_allclose(jnp.sum(ys**2, axis=1), 1.0, atol=1e-15)
+
+
+def test_copies_of_a_dense_solution():
+    """Diffrax's can be copied and pickled; of this one pickling says what to save."""
+    hook = mj.Projected(dfx.Tsit5(), CIRCLE)
+    saveat = dfx.SaveAt(dense=True)
+    sol = mj.diffeqsolve(TURN, hook, 0.0, 1.0, 0.5, START, jnp.asarray(2.0), saveat=saveat)
+    np.testing.assert_array_equal(copy.deepcopy(sol).evaluate(0.3), sol.evaluate(0.3))
+    with pytest.raises(TypeError, match=r"`jax.vmap\(sol.evaluate\)\(ts\)`"):
+        pickle.dumps(sol)

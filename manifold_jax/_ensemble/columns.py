@@ -49,10 +49,11 @@ class Layout(NamedTuple):
     def arrays(self, columns: list[jax.Array]) -> Any:
         """With the trajectories in front."""
         out, k = [], 0
-        for shape in self.shapes:
+        rows = columns[0].shape[0] if columns else 0
+        for shape, dtype in zip(self.shapes, self.dtypes, strict=True):
             size = int(np.prod(shape))
-            rows = columns[k].shape[0] if size else 0
-            out.append(jnp.stack(columns[k : k + size], axis=1).reshape(rows, *shape))
+            found = jnp.stack(columns[k : k + size], axis=1) if size else jnp.zeros(0, dtype)
+            out.append(found.reshape(rows, *shape))
             k += size
         return jtu.tree_unflatten(self.treedef, out)
 
@@ -63,9 +64,8 @@ def columns_of_values(tree: Any, lanes: Lanes) -> list[jax.Array]:
 
 def columns_of_arrays(tree: Any) -> list[jax.Array]:
     """Of arrays with the trajectories in front."""
-    return [
-        column for leaf in jtu.tree_leaves(tree) for column in leaf.reshape(leaf.shape[0], -1).T
-    ]
+    flat = lambda leaf: leaf.reshape(leaf.shape[0], math.prod(leaf.shape[1:]))
+    return [column for leaf in jtu.tree_leaves(tree) for column in flat(leaf).T]
 
 
 def taken(columns: list[jax.Array], index: jax.Array) -> list[jax.Array]:
