@@ -73,6 +73,18 @@ def test_hashed_dependence_misses_nothing(monkeypatch):
     assert pattern.dependence(jnp.cumsum, jnp.zeros(n)) is None
 
 
+def test_structures_that_are_found_again(monkeypatch):
+    """Of those that were forgotten meanwhile, too."""
+    neighbours = lambda x: jnp.diff(x) * x[1:]
+    first = structure.structure_of(((neighbours, jnp.ones(40)),))
+    monkeypatch.setattr(structure, "_FOUND", {})
+    again = structure.structure_of(((neighbours, jnp.ones(40)),))
+    assert first is not again
+    assert first == again
+    assert hash(first) == hash(again)
+    assert first != structure.structure_of(((neighbours, jnp.ones(41)),))
+
+
 def test_orders():
     """A chain whose equations are given in a random order, and one that is closed."""
     n = 50

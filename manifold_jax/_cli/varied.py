@@ -144,6 +144,9 @@ class ConstraintInArgs(AbstractConstraint):
     def push_forward(self, t: Any, y: Any, args: Any, directions: Any, vector: Any) -> Any:
         return self._of(args).push_forward(t, y, args.args, directions, vector)
 
+    def structure_at(self, t: Any, y: Any, args: Any = None) -> Any:
+        return self._of(args).structure_at(t, y, args.args)
+
     def faults(self, t: Any, y: Any, args: Any = None) -> Any:
         return self._of(args).faults(t, y, args.args)
 

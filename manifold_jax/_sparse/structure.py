@@ -31,17 +31,30 @@ class Structure:
     - `color`: of each unknown; no equation depends on two of the same color.
     - `local`: the equations that depend on unknowns of one block of masses only.
 
-    Compared by identity: one that is found again for the same program is the same object.
+    Compared by contents: one that is found again is the same static field, and compiles nothing anew.
     """
 
     def __init__(self, depends: sp.csr_matrix, per_block: int):
         self.num_equations, self.num_unknowns = depends.shape  # pyright: ignore[reportGeneralTypeIssues]
-        self._depends = depends
+        self._depends, self._per_block = depends, per_block
         blocks = _merged(depends, per_block)
         coupled = (blocks @ blocks.T).tocoo()
         self.order, self.width = _best_order(coupled)
         self.place = None if self.order is None else np.argsort(self.order).astype(np.int32)
         self.local = np.diff(blocks.indptr) == 1
+
+    @functools.cached_property
+    def _contents(self) -> tuple:
+        depends = self._depends
+        per_block, shape = self._per_block, depends.shape
+        return per_block, shape, depends.indptr.tobytes(), depends.indices.tobytes()
+
+    def __eq__(self, other: object) -> bool:
+        """By contents: a structure that is found again is the same static field."""
+        return isinstance(other, Structure) and self._contents == other._contents
+
+    def __hash__(self) -> int:
+        return hash(self._contents)
 
     @functools.cached_property
     def color(self) -> np.ndarray:
