@@ -119,8 +119,12 @@ class NewtonProjection(eqx.Module):
         """The same where `None` is not the masses. In the identity a correction of rounding size of a
         large component moves a small one by as much: Robertson's reaction to 1e11 with `atol=1e-14` has
         then 6.0 digits instead of 7.2, and makes 857 steps instead of 655."""
-        known = all(isinstance(x, int | float) for x in (self.rtol, self.atol))
-        if self.metric is None and known and self.atol < _SMALLEST * _rounding(y):  # pyright: ignore[reportOperatorIssue]
+        atol = self.atol if isinstance(self.rtol, int | float) else None
+        if (
+            self.metric is None
+            and isinstance(atol, int | float)
+            and atol < _SMALLEST * _rounding(y)
+        ):
             return self._error_weights(y)
         return self.inverse_metric(y)
 
