@@ -348,6 +348,7 @@ MISTAKES = {
     "Choose one of: uniform, normal, loguniform": ["args.length=gamma(0,1)"],
     "is not of the form": ["args.length=2"],
     "needs low < high": ["args.length=uniform(2,1)"],
+    "`args.length` is a length. Write": ["args.length=uniform(-2,-1)"],
     "needs std > 0": ["args.length=normal(2,0)"],
     "needs 0 < low < high": ["args.length=loguniform(0,1)"],
     "uniform(low, high) needs": ["args.length=uniform(a,1)"],

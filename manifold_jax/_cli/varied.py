@@ -63,7 +63,22 @@ def distributions(texts: list[str], problem: Problem) -> list[Distribution]:
         if any(target == before.target for before in out):
             raise typer.BadParameter(f"{target!r} is varied twice.", param_hint=_HINT)
         out.append(Distribution(target, kind, *_numbers(text, kind, match[3], match[4])))
+        _check_positive(out[-1], text)
     return out
+
+
+# Parts of names whose numbers have a sign: of a negative mass there is a solution, but no mechanism.
+_POSITIVE = ("length", "mass", "inertia", "radius")
+
+
+def _check_positive(one: Distribution, text: str) -> None:
+    name = next((word for word in _POSITIVE if word in one.target), None)
+    if one.kind == "uniform" and name is not None and one.target.startswith("args") and one.a <= 0:
+        raise typer.BadParameter(
+            f"{text!r} draws values that are not positive, but `{one.target}` is a {name}. Write "
+            f"`{one.target}=uniform(LOW, HIGH)` with 0 < LOW, or `loguniform`.",
+            param_hint=_HINT,
+        )
 
 
 def _numbers(text: str, kind: str, *words: str) -> tuple[float, float]:
