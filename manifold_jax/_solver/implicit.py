@@ -101,14 +101,14 @@ def with_tolerances_of_stages(
     solved to round-off in any case, and count as solved where half of the digits are right."""
     if isinstance(controller, dfx.AbstractAdaptiveStepSizeController):
         return solver
-    finder = getattr(solver, "root_finder", None)
+    finder, names = getattr(solver, "root_finder", None), ("rtol", "atol", "norm")
+    names = [name for name in names if getattr(finder, name, None) is use_stepsize_tol]
+    if not names:
+        return solver
     with jax.numpy_dtype_promotion("standard"):
         dtype = jnp.result_type(float, *jtu.tree_leaves(y0))
     half = float(jnp.finfo(dtype).eps) ** 0.5
     values = {"rtol": half, "atol": half, "norm": optx.rms_norm}
-    names = [name for name in values if getattr(finder, name, None) is use_stepsize_tol]
-    if not names:
-        return solver
     missing = lambda s: [getattr(s.root_finder, name) for name in names]
     return eqx.tree_at(missing, solver, [values[name] for name in names])
 
