@@ -96,7 +96,7 @@ def structure(index: int, seed: int) -> Structure:
     rng = np.random.default_rng((seed, index))
     choose = lambda options: options[int(rng.integers(len(options)))]
     chance = lambda probability: bool(rng.random() < probability)
-    family = _family(rng, choose, chance)
+    family = _longer(_family(rng, choose, chance), np.random.default_rng((seed, index, 1)))
     approach = _approach(family, choose, chance)
     solver, controller = _method(family, approach, choose, chance)
     low, implicit = solver in LOW_ORDER, solver in IMPLICIT + SPLIT
@@ -130,6 +130,14 @@ def structure(index: int, seed: int) -> Structure:
         single=chance(0.4),
         reverse=reverse,
     )
+
+
+def _longer(family: Family, rng: np.random.Generator) -> Family:
+    """Of some linkages one of 9 to 15 links: dense systems of that size are solved in another way."""
+    if not isinstance(family, Linkage) or family.redundant or rng.random() > 0.2:
+        return family
+    parents = tuple(int(rng.integers(max(-1, i - 3), i)) for i in range(int(rng.integers(9, 16))))
+    return dataclasses.replace(family, dimension=2, parents=parents)
 
 
 def _family(rng: np.random.Generator, choose: Any, chance: Any) -> Family:
