@@ -1,6 +1,6 @@
 """One structure after another in a process of its own; prints what was found as JSON lines.
 
-`python -m benchmarks._fuzz_worker SEED DRAWS INDEX...`"""
+`python -m benchmarks._fuzz_worker KIND SEED DRAWS INDEX...`"""
 
 import json
 import sys
@@ -11,6 +11,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from . import _fuzz_daes, _fuzz_stores
 from ._fuzz_checks import (
     check_accuracy,
     check_events,
@@ -22,6 +23,7 @@ from ._fuzz_checks import (
     is_okay,
     judge,
 )
+from ._fuzz_daes import Equations, equations
 from ._fuzz_gradients import check_gradients
 from ._fuzz_lanes import (
     amplification,
@@ -32,17 +34,24 @@ from ._fuzz_lanes import (
     with_failing_lane,
 )
 from ._fuzz_program import solve
+from ._fuzz_stores import Store, store
 from ._fuzz_structure import Structure, structure
 from ._measure import use_double_precision
 
 
-def examine(one: Structure, draws: int) -> dict[str, Any]:
+DRAWN = {"solve": structure, "dae": equations, "store": store}
+# What is checked in other ways than as a batch of solves.
+CHECKS = {Equations: _fuzz_daes.examine, Store: _fuzz_stores.examine}
+
+
+def examine(one: Any, draws: int) -> dict[str, Any]:
     """All checks of one structure."""
     started = time.perf_counter()
     record: dict[str, Any] = {"index": one.index, "seed": one.seed, "spec": one.spec}
     faults: list[Fault] = []
     try:
-        numbers = _checked(one, draws, faults)
+        check = CHECKS.get(type(one), _checked)
+        numbers = check(one, draws, faults)
     except Exception as error:
         lines = [line for line in str(error).splitlines() if line.strip()]
         place = traceback.extract_tb(error.__traceback__)[-1]
@@ -96,9 +105,10 @@ def _checked(one: Structure, draws: int, faults: list[Fault]) -> dict[str, Any]:
 
 def main() -> None:
     use_double_precision()
-    seed, draws, *indices = map(int, sys.argv[1:])
+    kind, *numbers = sys.argv[1:]
+    seed, draws, *indices = map(int, numbers)
     for index in indices:
-        record = examine(structure(index, seed), draws)
+        record = examine(DRAWN[kind](index, seed), draws)
         print(json.dumps(record), flush=True)
         jax.clear_caches()
 

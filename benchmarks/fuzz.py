@@ -6,9 +6,13 @@ A *structure* is what is compiled once: a random family of constraints and field
 state, a solver, a controller, what is saved, the direction of time, the approach, an adjoint. Its
 *draws* are the lanes of one batch, with other parameters and starts each, one of which is made to
 fail. `--only INDEX` runs one structure of the same seed again.
+
+`--kind dae` reduces random differential-algebraic equations with `manifold_jax.reduce_dae`;
+`--kind store` damages stored ensembles at random, one copy for each draw.
 """
 
 import collections
+import enum
 import json as json_module
 import subprocess
 import sys
@@ -25,6 +29,7 @@ from rich.console import Console
 from rich.table import Table
 
 from ._fuzz_structure import structure
+from ._fuzz_worker import DRAWN
 from ._measure import make_console
 
 
@@ -34,18 +39,30 @@ PER_PROCESS = 10
 Record = dict[str, Any]
 
 
-def run(indices: list[int], seed: int, draws: int, limit: float) -> Iterator[Record]:
+class Kind(enum.StrEnum):
+    """What is tried."""
+
+    SOLVE = "solve"
+    DAE = "dae"
+    STORE = "store"
+
+
+def run(
+    indices: list[int], seed: int, draws: int, limit: float, kind: str = "solve"
+) -> Iterator[Record]:
     """What is found, structure by structure. A process that takes longer than `limit` seconds for
     one, or that dies, is a fault; the next one goes on after it."""
     rest = list(indices)
     while rest:
-        for record in _in_one_process(rest[:PER_PROCESS], seed, draws, limit):
+        for record in _in_one_process(rest[:PER_PROCESS], seed, draws, limit, kind):
             rest.remove(record["index"])
             yield record
 
 
-def _in_one_process(indices: list[int], seed: int, draws: int, limit: float) -> Iterator[Record]:
-    command = [sys.executable, "-m", "benchmarks._fuzz_worker", str(seed), str(draws)]
+def _in_one_process(
+    indices: list[int], seed: int, draws: int, limit: float, kind: str
+) -> Iterator[Record]:
+    command = [sys.executable, "-m", "benchmarks._fuzz_worker", kind, str(seed), str(draws)]
     with tempfile.TemporaryFile("w+") as errors:
         process = subprocess.Popen(
             command + [str(i) for i in indices], stdout=subprocess.PIPE, stderr=errors, text=True
@@ -59,13 +76,13 @@ def _in_one_process(indices: list[int], seed: int, draws: int, limit: float) -> 
                 try:
                     line = lines.get(timeout=limit)
                 except Empty:
-                    yield _lost(i, seed, "hang", f"no answer in {limit:.0f} s", started)
+                    yield _lost(i, seed, kind, "hang", f"no answer in {limit:.0f} s", started)
                     return
                 if not line:
                     errors.seek(0)
                     last = errors.read().strip().splitlines()[-1:]
                     text = f"the process ended with {process.wait()}: {''.join(last)[:300]}"
-                    yield _lost(i, seed, "crash", text, started)
+                    yield _lost(i, seed, kind, "crash", text, started)
                     return
                 yield json_module.loads(line)
                 started = time.perf_counter()
@@ -84,13 +101,13 @@ def _read(process: subprocess.Popen, lines: Queue) -> None:
     lines.put("")
 
 
-def _lost(index: int, seed: int, kind: str, message: str, started: float) -> Record:
+def _lost(index: int, seed: int, kind: str, fault: str, message: str, started: float) -> Record:
     return {
         "index": index,
         "seed": seed,
-        "spec": structure(index, seed).spec,
+        "spec": DRAWN[kind](index, seed).spec,
         "seconds": round(time.perf_counter() - started, 1),
-        "faults": [{"kind": kind, "message": message}],
+        "faults": [{"kind": fault, "message": message}],
     }
 
 
@@ -145,6 +162,7 @@ def main(
     seed: Annotated[int, typer.Option(help="Of all random numbers.")] = 0,
     first: Annotated[int, typer.Option(help="Index of the first structure.")] = 0,
     only: Annotated[str, typer.Option(metavar="INDEX,...", help="These structures only.")] = "",
+    kind: Annotated[Kind, typer.Option(help="What is tried.")] = Kind.SOLVE,
     limit: Annotated[float, typer.Option(help="Seconds that one structure may take.")] = 900.0,
     json: Annotated[Path | None, typer.Option(metavar="FILE", help="A line for each.")] = None,
 ) -> None:
@@ -153,13 +171,14 @@ def main(
     indices = [int(i) for i in only.split(",")] if only else list(range(first, first + structures))
     records = []
     started = time.perf_counter()
-    for record in run(indices, seed, draws, limit):
+    for record in run(indices, seed, draws, limit, kind.value):
         records.append(record)
         show(console, record)
         if json is not None:
             with json.open("a") as file:
                 file.write(json_module.dumps(record) + "\n")
-    console.print(coverage(records))
+    if kind is Kind.SOLVE:
+        console.print(coverage(records))
     console.print(summary(records))
     cases = sum(record.get("cases", 0) for record in records)
     faulty = sum(bool(record["faults"]) for record in records)

@@ -156,3 +156,10 @@ def test_a_slice_finds_nothing():
     indices = [i for i in range(200) if cheap(structure(i, 1))][:6]
     for record in fuzz.run(indices, seed=1, draws=12, limit=300):
         assert record["faults"] == [], record["spec"]
+
+
+@pytest.mark.slow
+def test_reduced_equations_and_damaged_stores():
+    for kind, index in (("dae", 1), ("store", 1)):
+        (record,) = fuzz.run([index], seed=0, draws=12, limit=300, kind=kind)
+        assert record["faults"] == [], record["spec"]
