@@ -16,6 +16,7 @@ from .._solve.outcome import (
     is_without_time,
     messages_for,
     NO_TIME,
+    NOT_FINITE_START,
     UNUSABLE_START,
 )
 
@@ -29,8 +30,8 @@ class EnsembleSolution(eqx.Module):
     - `stats`: as of [`diffeqsolve`][] without `max_steps`, each of shape `(N,)`.
     - `result`: the result codes of all trajectories.
     - `execution`: "in lanes", or why not.
-    - `messages`: what the result codes mean, by number; the last two say of a trajectory without steps
-        that its times or its start could not be used.
+    - `messages`: what the result codes mean, by number; the last three say of a trajectory without
+        steps that its times or its start could not be used.
     """
 
     ts: PyTree[Array]
@@ -49,8 +50,10 @@ class EnsembleSolution(eqx.Module):
         """Numbers of `messages`, shape `(N,)`, 0 where a trajectory is successful."""
         codes = number_of_result(self.result)
         num_steps, last = self.stats["num_steps"], len(self.messages) - 1
-        codes = jnp.where(is_without_time(codes, num_steps), last - 1, codes)
-        codes = jnp.where(is_unusable_start(codes, num_steps), last, codes)
+        # A start that is not finite cannot be moved by a finite distance.
+        start = jnp.where(jnp.isnan(self.stats["initial_correction"]), last - 1, last)
+        codes = jnp.where(is_without_time(codes, num_steps), last - 2, codes)
+        codes = jnp.where(is_unusable_start(codes, num_steps), start, codes)
         return jnp.where(self.failed, codes, 0)
 
     def failures(self, most: int = 10) -> list[tuple[int, str]]:
@@ -66,4 +69,4 @@ class EnsembleSolution(eqx.Module):
 
 def messages_of(solver: dfx.AbstractSolver) -> tuple[str, ...]:
     """What `EnsembleSolution.reasons` are numbers of."""
-    return (*messages_for(solver), NO_TIME, UNUSABLE_START)
+    return (*messages_for(solver), NO_TIME, NOT_FINITE_START, UNUSABLE_START)

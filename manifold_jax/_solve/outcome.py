@@ -47,10 +47,13 @@ _TOO_MANY = (
     "steps become tiny near a singular configuration (`throw=False` says in `sol.ts` when), and with a tolerance "
     'below the round-off of 32-bit numbers (`jax.config.update("jax_enable_x64", True)`).'
 )
+NOT_FINITE_START = (
+    "`y0` has numbers that are NaN or infinite: nothing was solved. Start from a finite state."
+)
 UNUSABLE_START = (
-    "`y0` could not be made consistent with `constraint`: it has numbers that are not finite, no nearby state satisfies "
-    "the equations, or their Jacobian does not have full rank there. `mj.consistent_state(constraint, t0, y0, args)` of "
-    "this one says which."
+    "`y0` could not be made consistent with `constraint`: no nearby state satisfies the equations, their Jacobian does "
+    "not have full rank there, or they are not finite. `mj.consistent_state(constraint, t0, y0, args)` of this one says "
+    "which."
 )
 _NOT_TANGENT = (
     "The maximum number of solver steps was reached, and the corrections undid a large part of every step: the vector "
