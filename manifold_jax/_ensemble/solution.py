@@ -51,7 +51,8 @@ class EnsembleSolution(eqx.Module):
         codes = number_of_result(self.result)
         num_steps, last = self.stats["num_steps"], len(self.messages) - 1
         # A start that is not finite cannot be moved by a finite distance.
-        start = jnp.where(jnp.isnan(self.stats["initial_correction"]), last - 1, last)
+        moved = self.stats.get("initial_correction", jnp.zeros_like(num_steps, float))
+        start = jnp.where(jnp.isnan(moved), last - 1, last)
         codes = jnp.where(is_without_time(codes, num_steps), last - 2, codes)
         codes = jnp.where(is_unusable_start(codes, num_steps), start, codes)
         return jnp.where(self.failed, codes, 0)
