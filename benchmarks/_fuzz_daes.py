@@ -225,7 +225,7 @@ def _judge(
             ]
         )
         gap = np.abs(np.swapaxes(found["multiplier"], 0, 1) - exact)
-        sizes["multipliers"], limits["multipliers"] = gap.max(axis=(0, 2)), 1e-9
+        sizes["multipliers"], limits["multipliers"] = gap.max(axis=(0, 2)), limits["residual"]
     for name, size in sizes.items():
         numbers[name] = float(np.max(size[trusted], initial=0.0))
         wrong = np.flatnonzero(trusted & ~(size <= limits[name]))
