@@ -33,7 +33,7 @@ def main(port, number):
     # A number that does not divide is gathered.
     np.testing.assert_allclose(solve(mesh, throw=True).ys, one.ys, rtol=0, atol=1e-13)
     # Both raise, though only one has a trajectory that fails: the other would wait for ever.
-    with pytest.raises(RuntimeError, match="`y0` could not be made consistent"):
+    with pytest.raises(RuntimeError, match="`y0` has numbers that are NaN or infinite"):
         jax.block_until_ready(solve(mesh, STARTS.at[6].set(jnp.nan), throw=True))
 
     loss = lambda rate, starts, mesh: jnp.sum(solve(mesh, starts, rate).ys[..., 0] ** 2)
