@@ -13,10 +13,10 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 
-from manifold_jax._compare.approaches import APPROACHES, default_gain
-from manifold_jax._compare.report import sizes
-from manifold_jax._compare.task import as_rows
-from manifold_jax._compare.with_diffrax import SOLVERS
+from manifold_jax._tools.compare.approaches import APPROACHES, default_gain
+from manifold_jax._tools.compare.report import sizes
+from manifold_jax._tools.compare.task import as_rows
+from manifold_jax._tools.compare.with_diffrax import SOLVERS
 from manifold_jax.problems import Problem
 
 from ._candidates import Candidate, OfDiffrax, OfScipy, output_times, SCIPY_METHODS

@@ -14,8 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.integrate
 
-from manifold_jax._compare.approaches import Approach, default_gain, Formulation
-from manifold_jax._compare.task import as_rows
+from manifold_jax._tools.compare.approaches import Approach, default_gain, Formulation
+from manifold_jax._tools.compare.task import as_rows
 from manifold_jax.problems import Problem
 
 from ._counting import Counter, Evaluations

@@ -12,8 +12,8 @@ import jax.tree_util as jtu
 from jax.custom_derivatives import SymbolicZero
 
 import manifold_jax as mj
-from manifold_jax._compare.approaches import Formulation, with_vector_field
 from manifold_jax._mechanics import MechanicalConstraint
+from manifold_jax._tools.compare.approaches import Formulation, with_vector_field
 from manifold_jax.problems import Problem
 
 

@@ -8,7 +8,7 @@ import matplotlib
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from manifold_jax._compare.figure import STYLES
+from manifold_jax._tools.compare.figure import STYLES
 
 from ._approach_results import Row
 

@@ -15,8 +15,8 @@ import diffrax as dfx
 import typer
 from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
-from manifold_jax._compare.approaches import APPROACHES
-from manifold_jax._compare.with_diffrax import SOLVERS
+from manifold_jax._tools.compare.approaches import APPROACHES
+from manifold_jax._tools.compare.with_diffrax import SOLVERS
 from manifold_jax.problems import ALL
 
 from ._approach_results import measure, prepare, Row, Setting, setting

@@ -8,7 +8,7 @@ Ratios of run times, interleaved, medians:
   mechanisms of more and more equations, alone and in a batch, and the same ratio of compile times;
 - a gradient in a batch without / with the division that keeps XLA from computing stages again
   (`derivative_once` in the same file);
-- a gradient whose steps are recorded in large blocks / in small ones (`_adjoint/sizes.py`).
+- a gradient whose steps are recorded in large blocks / in small ones (`_adjoint/record.py`).
 """
 
 import dataclasses
@@ -25,9 +25,9 @@ import typer
 from rich.table import Table
 
 import manifold_jax as mj
-from manifold_jax._adjoint import sizes
-from manifold_jax._solver import explicit
-from manifold_jax._traced_length import num_equations
+from manifold_jax._adjoint import record
+from manifold_jax._jaxpr.trace import num_equations
+from manifold_jax._solver.step import explicit
 
 from ._measure import (
     compiled,
@@ -132,7 +132,7 @@ def comparisons(repeats: int) -> Iterator[Comparison]:
     yield compare(
         "gradient, without / with division", problem, gradient, as_it_is(), without, repeats
     )
-    large = changed(sizes, _SMALL=0)
+    large = changed(record, _SMALL=0)
     yield compare("gradient, large / small blocks", problem, gradient, as_it_is(), large, repeats)
 
 

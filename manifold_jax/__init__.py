@@ -9,29 +9,23 @@ from ._applications import (
     gradient_flow as gradient_flow,
     trace_curve as trace_curve,
 )
-from ._chart import (
-    AbstractChart as AbstractChart,
-    AbstractCoordinates as AbstractCoordinates,
-    CoordinatePartitionChart as CoordinatePartitionChart,
-    TangentSpaceChart as TangentSpaceChart,
-)
-from ._constraint import (
+from ._constraint.constraint import (
     AbstractConstraint as AbstractConstraint,
     Constraint as Constraint,
     Invariants as Invariants,
 )
-from ._dae import (
-    DAEReport as DAEReport,
-    reduce_dae as reduce_dae,
-    ReducedDAE as ReducedDAE,
-)
+from ._constraint.project import consistent_state as consistent_state, project as project
+from ._constraint.projection_info import ProjectionInfo as ProjectionInfo
+from ._constraint.settings import NewtonProjection as NewtonProjection
+from ._constraint.violation import constraint_violation as constraint_violation
+from ._dae import DAEReport as DAEReport, reduce_dae as reduce_dae, ReducedDAE as ReducedDAE
 from ._ensemble import (
     EnsembleSolution as EnsembleSolution,
     open_ensemble as open_ensemble,
     StoredEnsemble as StoredEnsemble,
 )
-from ._ensemble.solve_ensemble import solve_ensemble as solve_ensemble
-from ._ensemble.stream_ensemble import stream_ensemble as stream_ensemble
+from ._ensemble.api.solve_ensemble import solve_ensemble as solve_ensemble
+from ._ensemble.api.stream_ensemble import stream_ensemble as stream_ensemble
 from ._fit import FitResult as FitResult
 from ._fit.fit import fit as fit
 from ._mechanics import (
@@ -39,27 +33,25 @@ from ._mechanics import (
     MechanicalSystem as MechanicalSystem,
     VelocityStabilization as VelocityStabilization,
 )
-from ._project import consistent_state as consistent_state, project as project
-from ._projection import NewtonProjection as NewtonProjection
-from ._projection_info import ProjectionInfo as ProjectionInfo
-from ._rosenbrock import (
-    MassMatrixTerm as MassMatrixTerm,
-    Rodas3P as Rodas3P,
-    Rodas5P as Rodas5P,
-)
+from ._rosenbrock import MassMatrixTerm as MassMatrixTerm, Rodas3P as Rodas3P, Rodas5P as Rodas5P
 from ._solve.diffeqsolve import diffeqsolve as diffeqsolve
 from ._solver import (
     LocalCoordinates as LocalCoordinates,
     Projected as Projected,
     Stabilized as Stabilized,
 )
-from ._stabilization import (
+from ._solver.chart import (
+    AbstractChart as AbstractChart,
+    AbstractCoordinates as AbstractCoordinates,
+    CoordinatePartitionChart as CoordinatePartitionChart,
+    TangentSpaceChart as TangentSpaceChart,
+)
+from ._solver.stabilization import (
     AbstractStabilization as AbstractStabilization,
     ExactStabilization as ExactStabilization,
     InvariantStabilization as InvariantStabilization,
 )
-from ._tangent import tangent_field as tangent_field
-from ._violation import constraint_violation as constraint_violation
+from ._solver.tangent import tangent_field as tangent_field
 
 
 # isort: split
@@ -71,11 +63,7 @@ from ._lie_groups import (
     SO3 as SO3,
     UnitQuaternion as UnitQuaternion,
 )
-from ._manifolds import (
-    Product as Product,
-    Sphere as Sphere,
-    Stiefel as Stiefel,
-)
+from ._manifolds import Product as Product, Sphere as Sphere, Stiefel as Stiefel
 
 
 # isort: split

@@ -8,7 +8,7 @@ _EXTRA = {"typer", "rich", "click"}
 
 def main() -> None:
     try:
-        from ._cli import app
+        from ._tools.cli import app
     except ModuleNotFoundError as error:
         if error.name is None or error.name.split(".")[0] not in _EXTRA:
             raise

@@ -42,7 +42,7 @@ def _bounded_mappings():
 def missing_entry(monkeypatch):
     """As if a rule of the walk through the constraint were wrong: equation 5 not known to depend on
     unknown 0."""
-    from manifold_jax._sparse import structure  # not before the type checks are in place
+    from manifold_jax._linalg.sparse import structure  # not before the type checks are in place
 
     exact = structure.dependence
 

@@ -91,7 +91,7 @@ def test_gradient_with_one_sum(devices):
 
 
 def test_too_many_operations_take_the_ordinary_way_on_each(devices, monkeypatch):
-    module = importlib.import_module("manifold_jax._ensemble.in_lanes")
+    module = importlib.import_module("manifold_jax._ensemble.lanes.in_lanes")
     monkeypatch.setattr(module, "_LONGEST", 100)
     one, two = (solve(mesh, STARTS[:3], RATES[:3], lanes=3) for mesh in (None, Mesh(devices, "x")))
     jtu.tree_map(lambda a, b: np.testing.assert_allclose(a, b, rtol=0, atol=1e-13), one, two)

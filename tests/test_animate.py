@@ -7,8 +7,8 @@ from PIL import Image
 from typer.testing import CliRunner
 
 import manifold_jax as mj
-from manifold_jax._animate import SKETCHES
-from manifold_jax._cli import app
+from manifold_jax._tools.animate import SKETCHES
+from manifold_jax._tools.cli import app
 
 
 def lines_of(name, moved=0.0):

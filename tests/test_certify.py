@@ -12,11 +12,11 @@ import pytest
 from typer.testing import CliRunner
 
 from manifold_jax import problems
-from manifold_jax._certify import ADJOINTS, certificate_notes, certificate_scope, is_certified
-from manifold_jax._certify.case import Case, differences, Stepping
-from manifold_jax._certify.checks import certify, Check, Combination
-from manifold_jax._cli import app
-from manifold_jax._compare.approaches import APPROACHES
+from manifold_jax._tools.certify import ADJOINTS, certificate_notes, certificate_scope, is_certified
+from manifold_jax._tools.certify.case import Case, differences, Stepping
+from manifold_jax._tools.certify.checks import certify, Check, Combination
+from manifold_jax._tools.cli import app
+from manifold_jax._tools.compare.approaches import APPROACHES
 
 
 BAUMGARTE = next(a for a in APPROACHES if a.name == "baumgarte")

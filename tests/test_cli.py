@@ -14,9 +14,9 @@ from typer.testing import CliRunner
 
 import manifold_jax as mj
 from manifold_jax import problems
-from manifold_jax._cli import app
-from manifold_jax._compare import approaches, figure, methods, paper, report, with_diffrax
-from manifold_jax._compare.task import SolveFailed, Task
+from manifold_jax._tools.cli import app
+from manifold_jax._tools.compare import approaches, figure, methods, paper, report, with_diffrax
+from manifold_jax._tools.compare.task import SolveFailed, Task
 
 
 ROW_KEYS = {
@@ -518,7 +518,7 @@ def test_importing_the_command_line_does_not_change_the_precision(tmp_path):
     import subprocess
     import sys
 
-    code = "import manifold_jax._cli, jax; print(jax.config.jax_enable_x64)"
+    code = "import manifold_jax._tools.cli, jax; print(jax.config.jax_enable_x64)"
     command = [sys.executable, "-c", code]
     environment = {"JAX_ENABLE_X64": "0", "JAX_PLATFORMS": "cpu", "HOME": str(tmp_path)}
     output = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)

@@ -8,10 +8,10 @@ import pytest
 from rich.console import Console
 from typer.testing import CliRunner
 
-from manifold_jax import _certify
-from manifold_jax._certify.checks import Check, Combination
-from manifold_jax._cli import app, commands
-from manifold_jax._compare import methods, paper
+from manifold_jax._tools import certify as _certify
+from manifold_jax._tools.certify.checks import Check, Combination
+from manifold_jax._tools.cli import app, commands
+from manifold_jax._tools.compare import methods, paper
 
 
 WIDTHS = (40, 60, 80, 100, 120)

@@ -10,7 +10,7 @@ import pytest
 from optimized import optimized_jit
 
 import manifold_jax as mj
-from manifold_jax._solver import explicit
+from manifold_jax._solver.step import explicit
 
 
 RIGID_BODY = mj.problems.rigid_body()

@@ -10,7 +10,7 @@ from manifold_jax._dae.compressed import _colors
 from manifold_jax._dae.equations import Equations
 from manifold_jax._dae.occurrence import nonlinear_unknowns, Occurrence, Point
 from manifold_jax._dae.signature import ABSENT, signature, SingularParts, Structure
-from manifold_jax._incidence import incidence
+from manifold_jax._jaxpr.incidence import incidence
 
 
 def depends(function, n=6):

@@ -12,13 +12,13 @@ from variants import variants
 
 import manifold_jax as mj
 from manifold_jax._applications.following import kernel
-from manifold_jax._closure import convert_closure
+from manifold_jax._base.closure import convert_closure
+from manifold_jax._base.derivative_rule import ForwardRule
 from manifold_jax._dae.pivots import Pivoted
-from manifold_jax._derivative_rule import ForwardRule
-from manifold_jax._linear import Elimination, factorize, factorize_once, pseudo_invert
-from manifold_jax._newton import root_of_step
-from manifold_jax._rosenbrock.elimination import factorize_pivoted
-from manifold_jax._solver.explicit import derivative_once
+from manifold_jax._linalg.dense import Elimination, factorize, factorize_once, pseudo_invert
+from manifold_jax._linalg.newton import root_of_step
+from manifold_jax._linalg.pivoted import factorize_pivoted
+from manifold_jax._solver.step.explicit import derivative_once
 
 
 def matrix(a, n):

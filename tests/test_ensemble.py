@@ -12,9 +12,9 @@ from jax.sharding import Mesh
 import manifold_jax as mj
 
 
-execution = importlib.import_module("manifold_jax._ensemble.execution")
-in_lanes = importlib.import_module("manifold_jax._ensemble.in_lanes")
-reverse = importlib.import_module("manifold_jax._ensemble.reverse")
+execution = importlib.import_module("manifold_jax._ensemble.lanes.execution")
+in_lanes = importlib.import_module("manifold_jax._ensemble.lanes.in_lanes")
+reverse = importlib.import_module("manifold_jax._ensemble.lanes.reverse")
 PID = dfx.PIDController(rtol=1e-6, atol=1e-6)
 CIRCLE = mj.Constraint(lambda t, y, args: y @ y - 1)
 TURN = dfx.ODETerm(lambda t, y, args: args * jnp.stack([-y[1], y[0]]) * (1 + y[0] ** 2 * t))

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 import manifold_jax as mj
-from manifold_jax._solver.execution import CarriedDerivative, execution_of, OwnStep, WrittenOut
-from manifold_jax._solver.frame import Frame
+from manifold_jax._solver.step.execution import CarriedDerivative, execution_of, OwnStep, WrittenOut
+from manifold_jax._solver.step.frame import Frame
 
 
 CIRCLE = mj.Constraint(lambda t, y, args: y["x"] @ y["x"] - 1.0)

@@ -5,15 +5,15 @@ import sys
 import pytest
 
 from manifold_jax import __main__ as command_line
-from manifold_jax._ensemble.progress import Meter
-from manifold_jax._extras import require
+from manifold_jax._base.extras import require
+from manifold_jax._ensemble.api.progress import Meter
 
 
 @pytest.fixture
 def without(monkeypatch):
     def hide(*names):
         for name in list(sys.modules):
-            if name.split(".")[0] in names or name.startswith("manifold_jax._cli"):
+            if name.split(".")[0] in names or name.startswith("manifold_jax._tools.cli"):
                 monkeypatch.delitem(sys.modules, name)
         for name in names:
             monkeypatch.setitem(sys.modules, name, None)

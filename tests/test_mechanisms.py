@@ -18,11 +18,7 @@ import scipy.special
 
 import manifold_jax as mj
 from manifold_jax import problems
-from manifold_jax.problems.heavy_top import (
-    BENCHMARK,
-    BENCHMARK_DISPLACEMENT,
-    BENCHMARK_QUATERNION,
-)
+from manifold_jax.problems.heavy_top import BENCHMARK, BENCHMARK_DISPLACEMENT, BENCHMARK_QUATERNION
 from manifold_jax.problems.slider_crank import PUBLISHED
 
 

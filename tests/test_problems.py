@@ -12,12 +12,7 @@ import pytest
 import scipy.integrate
 
 from manifold_jax import problems
-from manifold_jax.problems.lotka_volterra import (
-    COST_BY_RATES,
-    COST_BY_START,
-    END,
-    PUBLISHED_END,
-)
+from manifold_jax.problems.lotka_volterra import COST_BY_RATES, COST_BY_START, END, PUBLISHED_END
 from manifold_jax.problems.pendulum import A01_X, A01_Y
 
 

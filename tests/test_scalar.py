@@ -7,7 +7,9 @@ import numpy as np
 import pytest
 
 import manifold_jax as mj
-from manifold_jax._scalar import call_in_lanes, Lanes, NotScalarError, Value
+from manifold_jax._jaxpr.lane_arrays import Lanes, NotScalarError
+from manifold_jax._jaxpr.lane_interpreter import call_in_lanes
+from manifold_jax._jaxpr.lane_value import Value
 
 
 SIZE = 5

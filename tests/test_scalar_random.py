@@ -15,7 +15,9 @@ import numpy as np
 import pytest
 from jax import lax
 
-from manifold_jax._scalar import call_in_lanes, Lanes, Value
+from manifold_jax._jaxpr.lane_arrays import Lanes
+from manifold_jax._jaxpr.lane_interpreter import call_in_lanes
+from manifold_jax._jaxpr.lane_value import Value
 
 
 SIZE = 6

@@ -9,8 +9,8 @@ import pytest
 import scipy.sparse as sp
 
 import manifold_jax as mj
-from manifold_jax._sparse import pattern, structure
-from manifold_jax._sparse.elimination import Blocks, eliminate
+from manifold_jax._linalg.sparse import pattern, structure
+from manifold_jax._linalg.sparse.elimination import Blocks, eliminate
 
 
 def chain(links, choice, **kwargs):

@@ -140,7 +140,7 @@ def test_what_is_finished_is_not_computed_again(whole, monkeypatch, tmp_path):
     def refuse(*args):
         raise AssertionError("computed again")
 
-    monkeypatch.setattr(sys.modules["manifold_jax._ensemble.stream_ensemble"], "write", refuse)
+    monkeypatch.setattr(sys.modules["manifold_jax._ensemble.api.stream_ensemble"], "write", refuse)
     before = contents(whole)
     for function in (streamed.sample, same):  # whatever they are called
         stream(whole, resume=True, sample=function)
@@ -216,14 +216,14 @@ def test_a_full_disk(whole, tmp_path, monkeypatch):
     largest = max(len(x) for name, x in contents(whole).items() if name.startswith("ys/0/c/"))
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     old = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-    create = sys.modules["manifold_jax._ensemble.stream_ensemble"].create_arrays
+    create = sys.modules["manifold_jax._ensemble.api.stream_ensemble"].create_arrays
 
     def then_full(*args):
         create(*args)
         resource.setrlimit(resource.RLIMIT_FSIZE, (largest - 200, hard))
 
     monkeypatch.setattr(
-        sys.modules["manifold_jax._ensemble.stream_ensemble"], "create_arrays", then_full
+        sys.modules["manifold_jax._ensemble.api.stream_ensemble"], "create_arrays", then_full
     )
     try:
         with pytest.raises(OSError, match=r"cannot write to `out=.*go on with `resume=True`") as e:

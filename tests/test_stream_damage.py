@@ -95,7 +95,7 @@ def test_two_writers(copy):
     (copy / "writer.lock").write_text("process 1 on a machine of old")
     holds = (
         "import sys, time; from pathlib import Path\n"
-        "from manifold_jax._ensemble.store_lock import only_writer\n"
+        "from manifold_jax._ensemble.stored.lock import only_writer\n"
         "with only_writer(Path(sys.argv[1])): print('held', flush=True); time.sleep(60)"
     )
     command = [sys.executable, "-c", holds, str(copy)]

@@ -8,8 +8,8 @@ import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 
-from .._compat import unvmap_max
-from .._custom_types import IntScalar
+from .._base.compat import unvmap_max
+from .._base.types import IntScalar
 from .gradient import add, Ends, Gradient, Step, TimesBar
 from .record import Record, Vectors
 from .replay import State

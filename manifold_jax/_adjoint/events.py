@@ -11,8 +11,8 @@ import optimistix as optx
 from diffrax import RESULTS
 from jaxtyping import Array, Bool, Float
 
-from .._closure import convert_closure
-from .._compat import (
+from .._base.closure import convert_closure
+from .._base.compat import (
     Ending,
     LastStep,
     nonlinear_failure,
@@ -22,8 +22,8 @@ from .._compat import (
     unvmap_any,
     update_result,
 )
-from .._custom_types import Args, BoolScalar, FloatScalar, IntScalar, Y
-from .._newton import root_of_step
+from .._base.types import Args, BoolScalar, FloatScalar, IntScalar, Y
+from .._linalg.newton import root_of_step
 from .._solver.base import AbstractManifoldSolver
 
 

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, Bool, Float
 
-from .._custom_types import FloatScalar, IntScalar, Y
+from .._base.types import FloatScalar, IntScalar, Y
 from .record import Vectors
 from .replay import State
 

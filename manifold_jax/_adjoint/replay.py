@@ -11,13 +11,13 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array
 
-from .._closure import convert_closure
-from .._compat import LoopState, Progress
-from .._custom_types import Args, RealScalarLike, Y
-from .._projection_info import ProjectionInfo
-from .._solver.advance import HookState
-from .._solver.execution import execution_of, WrittenOut
-from .._solver.frame import Frame
+from .._base.closure import convert_closure
+from .._base.compat import Differentiable, LoopState, Progress
+from .._base.types import Args, RealScalarLike, Y
+from .._constraint.projection_info import ProjectionInfo
+from .._solver.step.advance import HookState
+from .._solver.step.execution import execution_of, WrittenOut
+from .._solver.step.frame import Frame
 
 
 class State(NamedTuple):
@@ -137,3 +137,30 @@ def may_jump(controller: Any, made_jump: Any) -> bool:
         controller = controller.controller
     known = dfx.ConstantStepSize | dfx.StepTo | dfx.PIDController
     return not isinstance(controller, known)
+
+
+class HandedOut(NamedTuple):
+    """What has derivatives of the final state of a loop, of the solver's state what steps depend
+    on."""
+
+    ts: list[Any]
+    ys: list[Any]
+    dense_ts: Any
+    dense_infos: Any
+    event_dense_info: Any
+    state: State
+
+    @staticmethod
+    def of(final_state: LoopState, remembers: bool) -> "HandedOut":
+        of = Differentiable.of(final_state)
+        memory = memory_of(of.solver_state) if remembers else None
+        dense = of.dense_ts, of.dense_infos, of.event_dense_info
+        return HandedOut(of.ts, of.ys, *dense, State(of.y, memory))
+
+    def put_into(self, final_state: LoopState) -> LoopState:
+        y, memory = self.state
+        solver_state = Differentiable.of(final_state).solver_state
+        if memory is not None:
+            solver_state = with_memory(solver_state, memory)
+        dense = self.dense_ts, self.dense_infos, self.event_dense_info
+        return Differentiable(self.ts, self.ys, *dense, y, solver_state).put_into(final_state)

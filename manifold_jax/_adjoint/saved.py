@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, Bool, Float
 
-from .._custom_types import FloatScalar, IntScalar, RealScalarLike, Y
+from .._base.types import FloatScalar, IntScalar, RealScalarLike, Y
 from .gradient import add, Ends, Gradient, replaced, Step
 from .replay import Replay
 

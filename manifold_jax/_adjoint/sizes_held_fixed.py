@@ -9,8 +9,8 @@ import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 
-from .._compat import LoopState, Progress, with_next_time
-from .._newton import without_derivative
+from .._base.compat import LoopState, Progress, with_next_time
+from .._linalg.newton import without_derivative
 
 
 class SizesHeldFixed(dfx.AbstractStepSizeController):

@@ -4,8 +4,8 @@ from typing import Any
 
 import diffrax as dfx
 
-from .._compat import LoopState, Progress, with_result
-from .._rejection import result_of_state
+from .._base.compat import LoopState, Progress, with_result
+from .._base.rejection import result_of_state
 
 
 class CheckedStartAdjoint(dfx.AbstractAdjoint):

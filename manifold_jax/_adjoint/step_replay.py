@@ -7,8 +7,8 @@ import equinox as eqx
 import jax.numpy as jnp
 import jax.tree_util as jtu
 
-from .._closure import convert_closure
-from .._compat import (
+from .._base.closure import convert_closure
+from .._base.compat import (
     diffrax_loop,
     is_unsafe_sde,
     nondifferentiable,
@@ -16,12 +16,11 @@ from .._compat import (
     save_states,
     while_loop,
 )
-from .._derivative_rule import apply_linear, ForwardRule
+from .._base.derivative_rule import apply_linear, ForwardRule
 from .backwards import Backwards, DenseBars
 from .gradient import Ends, TimesBar
-from .handed_out import HandedOut
 from .record import Record, recording
-from .replay import Replay, Solve
+from .replay import HandedOut, Replay, Solve
 from .saved import Functions, Rows, SavedValues
 from .sizes_held_fixed import event_of_controller, SizesHeldFixed, with_end_held_fixed
 

@@ -6,7 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from .._compat import is_okay
+from .._base.compat import is_okay
 
 
 def check_function(name: str, function: Any, shape: tuple[int, ...], why: str, *inputs: Any):

@@ -11,12 +11,12 @@ from diffrax import RESULTS
 from jaxtyping import Array, Float
 
 from .._adjoint import StepReplayAdjoint
-from .._closure import convert_closure
-from .._compat import nonlinear_failure
-from .._constraint_checks import check_state
-from .._custom_types import Args, IntScalar, RealScalarLike
-from .._errors import clear_errors
-from .._numbers import numbers_as_arrays
+from .._base.closure import convert_closure
+from .._base.compat import nonlinear_failure
+from .._base.errors import clear_errors
+from .._base.numbers import numbers_as_arrays
+from .._base.types import Args, IntScalar, RealScalarLike
+from .._constraint.checks import check_state
 from .checks import as_curve_start, as_direction, check_counts, check_function, raise_if_failed
 from .following import Curve, follow, start_on, unbroken
 from .turning_points import find_turns

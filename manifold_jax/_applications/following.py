@@ -9,13 +9,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from .._constraint import Constraint
-from .._custom_types import Args, BoolScalar, FloatScalar, IntScalar, RealScalarLike
-from .._linear import Elimination, reduction
-from .._newton import without_derivative
-from .._project import consistent_state
-from .._projection_info import ProjectionInfo
-from .._residual import jacobian
+from .._base.types import Args, BoolScalar, FloatScalar, IntScalar, RealScalarLike
+from .._constraint.constraint import Constraint
+from .._constraint.project import consistent_state
+from .._constraint.projection_info import ProjectionInfo
+from .._constraint.residual import jacobian
+from .._linalg.dense import Elimination, reduction
+from .._linalg.newton import without_derivative
 from .._solve import diffeqsolve
 from .._solver import Projected
 

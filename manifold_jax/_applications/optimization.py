@@ -12,16 +12,16 @@ import jax.tree_util as jtu
 from diffrax import RESULTS
 from jaxtyping import Array, Bool, Float
 
-from .._closure import convert_closure
-from .._compat import is_okay, nonlinear_failure
-from .._constraint import AbstractConstraint, Constraint
-from .._constraint_checks import check_constraint, check_state
-from .._custom_types import Args, BoolScalar, FloatScalar, RealScalarLike, Y
-from .._errors import clear_errors
-from .._newton import without_derivative
-from .._numbers import numbers_as_arrays
-from .._projection import NewtonProjection
-from .._residual import residual_vector, row_scale
+from .._base.closure import convert_closure
+from .._base.compat import is_okay, nonlinear_failure
+from .._base.errors import clear_errors
+from .._base.numbers import numbers_as_arrays
+from .._base.types import Args, BoolScalar, FloatScalar, RealScalarLike, Y
+from .._constraint.checks import check_constraint, check_state
+from .._constraint.constraint import AbstractConstraint, Constraint
+from .._constraint.residual import residual_vector, row_scale
+from .._constraint.settings import NewtonProjection
+from .._linalg.newton import without_derivative
 from .._solve import diffeqsolve
 from .._solver import Projected
 from .checks import check_function, raise_if_failed

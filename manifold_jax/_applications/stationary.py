@@ -8,10 +8,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._custom_types import Args, BoolScalar, FloatScalar
-from .._linear import Elimination, Factorization, factorize, gram
-from .._newton import AbstractEquations, find_root, implicit_root, without_derivative
-from .._residual import jacobian, row_scale
+from .._base.types import Args, BoolScalar, FloatScalar
+from .._constraint.residual import jacobian, row_scale
+from .._linalg.dense import Elimination, Factorization, factorize, gram
+from .._linalg.newton import AbstractEquations, find_root, implicit_root, without_derivative
 
 
 class Lagrangian(eqx.Module):

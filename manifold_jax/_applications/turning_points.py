@@ -8,9 +8,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from .._closure import convert_closure
-from .._custom_types import FloatScalar, IntScalar
-from .._newton import root_of_step, without_derivative
+from .._base.closure import convert_closure
+from .._base.types import FloatScalar, IntScalar
+from .._linalg.newton import root_of_step, without_derivative
 from .following import Curve, Nodes
 
 

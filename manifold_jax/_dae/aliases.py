@@ -13,7 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from .equations import Equations
-from .occurrence import Occurrence, Point
+from .occurrence import nonlinear_unknowns, Occurrence, Point
+from .signature import Structure
 
 
 class Aliases(NamedTuple):
@@ -92,3 +93,30 @@ def _along(equations: Equations, point: Point, zero: Any, ones: Any, higher: lis
         return values, a, b
 
     return evaluate(point.t, point.args)
+
+
+def lifted(equations: Equations, aliases: Aliases, structure: Structure, point: Point) -> Structure:
+    """The structure with the fewest differentiations in which the equations with `c_i = 0`, too,
+    are linear in the leading derivatives."""
+    belongs_to = np.argsort(structure.transversal)
+    while (found := _nonlinear(equations, aliases, structure, point)).any():
+        at_least = structure.c.copy()
+        at_least[belongs_to[found]] += 1
+        raised = Structure.of(structure.sigma, at_least)
+        assert raised is not None
+        structure = raised
+    return structure
+
+
+def _nonlinear(
+    equations: Equations, aliases: Aliases, structure: Structure, point: Point
+) -> np.ndarray:
+    """Of the leading derivatives, in equations that are not differentiated."""
+    compact = np.searchsorted(aliases.roots, aliases.root)
+    levels = structure.d[compact] - aliases.shift
+    (unknowns,) = np.nonzero((levels >= 0) & (levels <= equations.order))
+    depends = nonlinear_unknowns(equations, point, levels[unknowns], unknowns)
+    there = depends[aliases.rows[structure.c == 0]].any(axis=0)
+    found = np.zeros(len(structure.d), bool)
+    found[compact[unknowns[there]]] = True
+    return found

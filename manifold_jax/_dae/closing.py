@@ -8,13 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._custom_types import Args
-from .._newton import AbstractEquations, implicit_root, without_derivative
+from .._base.types import Args
+from .._linalg.newton import AbstractEquations, implicit_root, without_derivative
 from .compressed import Compressed
-from .derivatives import total_derivatives
+from .derivatives import pick, total_derivatives
 from .equations import Equations
 from .layout import Layout
-from .picking import pick
 from .pivots import Eliminated, Elimination
 from .signature import Structure
 

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from .._incidence import incidence
+from .._jaxpr.incidence import incidence
 from .aliases import Aliases
 from .equations import Combination, Equations
 from .layout import Layout

@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from .._custom_types import Args
+from .._base.types import Args
 from .aliases import Aliases
-from .picking import pick
+from .derivatives import pick
 from .signature import Structure
 
 

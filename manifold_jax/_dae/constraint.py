@@ -11,15 +11,14 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._constraint import AbstractConstraint
-from .._constraint_checks import check_state
-from .._custom_types import Args, BoolScalar, RealScalarLike, Y
-from .._newton import implicit_root
-from .._residual import as_time
+from .._base.types import Args, BoolScalar, RealScalarLike, Y
+from .._constraint.checks import check_state
+from .._constraint.constraint import AbstractConstraint
+from .._constraint.residual import as_time
+from .._linalg.newton import implicit_root
 from .closing import Closing, Static
-from .derivatives import total_derivatives
+from .derivatives import pick, total_derivatives
 from .equations import Equations
-from .picking import pick
 
 
 _SINGULAR = (

@@ -11,9 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._custom_types import Args, BoolScalar, RealScalarLike
-from .._newton import AbstractEquations, damped_newton, implicit_root, without_derivative
-from .._projection import NewtonProjection
+from .._base.types import Args, BoolScalar, RealScalarLike
+from .._constraint.settings import NewtonProjection
+from .._linalg.newton import AbstractEquations, damped_newton, implicit_root, without_derivative
 from .closing import Closing
 from .constraint import Reduced
 from .layout import Layout

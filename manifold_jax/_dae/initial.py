@@ -11,18 +11,18 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._custom_types import Args, BoolScalar, RealScalarLike, Y
-from .._errors import clear_errors
-from .._linear import gram
-from .._newton import without_derivative
-from .._numbers import numbers_as_arrays
-from .._projection import NewtonProjection
-from .._projection_info import ProjectionInfo
-from .._residual import as_time, jacobian, row_scale
+from .._base.errors import clear_errors
+from .._base.numbers import numbers_as_arrays
+from .._base.types import Args, BoolScalar, RealScalarLike, Y
+from .._constraint.projection_info import ProjectionInfo
+from .._constraint.residual import as_time, jacobian, row_scale
+from .._constraint.settings import NewtonProjection
+from .._linalg.dense import gram
+from .._linalg.newton import without_derivative
 from .constraint import hidden_constraints, Reduced
+from .equations import leaf_names, listed
 from .implicit import leading
 from .layout import Gather, Layout
-from .names import leaf_names, listed
 from .nearest import nearest_state, with_lifted
 from .pivots import Pivoted
 from .samples import condition, dependent_rows, singular_below

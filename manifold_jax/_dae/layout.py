@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .aliases import Aliases
-from .picking import pick
+from .derivatives import pick
 from .signature import Structure
 
 

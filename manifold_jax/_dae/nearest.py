@@ -15,18 +15,18 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._custom_types import Args, BoolScalar, FloatScalar, IntScalar
-from .._linear import gram
-from .._newton import (
+from .._base.types import Args, BoolScalar, FloatScalar, IntScalar
+from .._constraint.residual import jacobian
+from .._constraint.settings import NewtonProjection
+from .._linalg.dense import gram
+from .._linalg.newton import (
     AbstractEquations,
     damped_newton,
     implicit_root,
     Iterate,
     without_derivative,
 )
-from .._projection import NewtonProjection
-from .._residual import jacobian
-from .._rows import combine, multiply
+from .._linalg.rows import combine, multiply
 from .constraint import hidden_constraints, Reduced
 from .pivots import Pivoted
 

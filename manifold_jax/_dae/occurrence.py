@@ -8,10 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from .._custom_types import Args
-from .._incidence import incidence
+from .._base.types import Args
+from .._jaxpr.incidence import incidence
+from .derivatives import pick
 from .equations import Equations
-from .picking import pick
 
 
 class Point(NamedTuple):

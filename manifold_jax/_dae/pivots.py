@@ -9,11 +9,11 @@ import jax.scipy.linalg as jsl
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._custom_types import BoolScalar
-from .._linear import Factorization, factorize, gram, reduction, UNROLL_LIMIT
-from .._rows import multiply
+from .._base.types import BoolScalar
+from .._linalg.dense import Factorization, factorize, gram, reduction, UNROLL_LIMIT
+from .._linalg.rows import multiply
 from .compressed import Compressed
-from .picking import pick
+from .derivatives import pick
 
 
 # Of a pivot, relative to the largest entry of its row.

@@ -10,17 +10,15 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 
-from .._custom_types import Args, Y
-from .._numbers import with_arrays
-from .aliases import Aliases
+from .._base.numbers import with_arrays
+from .._base.types import Args, Y
+from .aliases import Aliases, lifted
 from .closing import Plan, Static
 from .combined import cancelled
 from .compressed import Compressed
 from .constraint import Reduced
-from .equations import Equations
+from .equations import Equations, listed
 from .layout import Layout
-from .lifting import lifted
-from .names import listed
 from .occurrence import Occurrence, Point
 from .pivots import Elimination
 from .report import DAEReport

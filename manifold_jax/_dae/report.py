@@ -4,9 +4,8 @@ import dataclasses
 
 import numpy as np
 
-from .equations import Equations
+from .equations import Equations, listed
 from .layout import Layout
-from .names import listed
 from .occurrence import Occurrence
 from .samples import Samples
 from .signature import ABSENT, Structure

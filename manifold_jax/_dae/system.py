@@ -6,9 +6,9 @@ import diffrax as dfx
 import equinox as eqx
 from jaxtyping import Array, Float
 
-from .._custom_types import Args, RealScalarLike, Y
-from .._numbers import numbers_as_arrays
-from .._projection_info import ProjectionInfo
+from .._base.numbers import numbers_as_arrays
+from .._base.types import Args, RealScalarLike, Y
+from .._constraint.projection_info import ProjectionInfo
 from .._rosenbrock import MassMatrixTerm
 from .constraint import rate, Reduced, ReducedConstraint, unknowns_with_derivatives
 from .implicit import implicit_field, mass

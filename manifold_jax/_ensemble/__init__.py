@@ -1,2 +1,2 @@
-from .solution import EnsembleSolution as EnsembleSolution
-from .store import open_ensemble as open_ensemble, StoredEnsemble as StoredEnsemble
+from .lanes.solution import EnsembleSolution as EnsembleSolution
+from .stored.store import open_ensemble as open_ensemble, StoredEnsemble as StoredEnsemble

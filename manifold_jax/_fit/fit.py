@@ -16,13 +16,7 @@ from .optimize import Options
 from .parameters import make_transform
 from .progress import Meter
 from .report import FitResult
-from .setup import (
-    check_amount,
-    check_initial,
-    check_options,
-    make_objective,
-    refuse_tracers,
-)
+from .setup import check_amount, check_initial, check_options, make_objective, refuse_tracers
 from .starts import choose, draw_points, optimize_all, see, with_scales
 from .summary import summarize
 

@@ -11,10 +11,10 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, Float
 
-from .._compat import is_okay
-from .._constraint import AbstractConstraint, Invariants
-from .._constraint_checks import check_state
-from .._custom_types import Args, BoolScalar, FloatScalar, IntScalar, Y
+from .._base.compat import is_okay
+from .._base.types import Args, BoolScalar, FloatScalar, IntScalar, Y
+from .._constraint.checks import check_state
+from .._constraint.constraint import AbstractConstraint, Invariants
 from .._mechanics import MechanicalSystem
 from .._solve import diffeqsolve
 from .._solver import Projected

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._adjoint import StepReplayAdjoint
-from .._custom_types import FloatScalar
+from .._base.types import FloatScalar
 from .model import Piece, Prediction, Simulator
 from .parameters import Transform
 

@@ -10,14 +10,7 @@ import numpy as np
 import optax
 import optimistix as optx
 
-from .bounds import (
-    BESIDE,
-    driven,
-    left_if_linear,
-    on_bounds,
-    put_beside_bounds,
-    put_on_bounds,
-)
+from .bounds import BESIDE, driven, left_if_linear, on_bounds, put_beside_bounds, put_on_bounds
 from .convergence import at_minimum, flat, stalled
 from .objective import gaps, Objective, residuals, Solved, total_loss
 from .progress import Meter

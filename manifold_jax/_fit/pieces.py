@@ -9,9 +9,9 @@ import jax.flatten_util as jfu
 import jax.numpy as jnp
 import numpy as np
 
-from .._constraint import Invariants
-from .._constraint_checks import check_constraint
-from .._residual import jacobian, residual_vector
+from .._constraint.checks import check_constraint
+from .._constraint.constraint import Invariants
+from .._constraint.residual import jacobian, residual_vector
 from .data import filled_in_time, flatten, Records
 from .model import at_start, Piece, Simulator
 from .parameters import Transform

@@ -4,7 +4,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from .._terminal_bar import NoBar, print_line, terminal_bar
+from .._base.extras import NoBar, print_line, terminal_bar
 
 
 class Meter:

@@ -8,7 +8,7 @@ import jax.tree_util as jtu
 import numpy as np
 from scipy.special import chdtrc
 
-from .._extras import require
+from .._base.extras import require
 
 
 # Truly wrong models are "rejected with vastly smaller values" (Press et al., Numerical Recipes, 15.1).

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 
-from .._project import consistent_state
+from .._constraint.project import consistent_state
 from .data import Records, unflatten
 from .objective import Objective
 from .optimize import Outcome

@@ -9,14 +9,14 @@ import jax.flatten_util as jfu
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._constraint import AbstractConstraint
-from .._correction import Normals, without_normal_part
-from .._custom_types import Args, BoolScalar, RealScalarLike, Y
-from .._projection import NewtonProjection
-from .._projection_info import ProjectionInfo
-from .._residual import as_time, residual_vector
-from .._rows import multiply
-from .._sparse import Choice, Structure, structure_of
+from .._base.types import Args, BoolScalar, RealScalarLike, Y
+from .._constraint.constraint import AbstractConstraint
+from .._constraint.correction import Normals, without_normal_part
+from .._constraint.projection_info import ProjectionInfo
+from .._constraint.residual import as_time, residual_vector
+from .._constraint.settings import NewtonProjection
+from .._linalg.rows import multiply
+from .._linalg.sparse import Choice, Structure, structure_of
 from .correction import InverseMetrics, TwoStages
 from .kinematics import Kinematics
 

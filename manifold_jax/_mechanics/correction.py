@@ -17,12 +17,18 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._closure import convert_closure
-from .._correction import CorrectionEquations, CorrectionRoot, Crossing, Normals, solve_correction
-from .._custom_types import Args, BoolScalar, Y
-from .._projection import NewtonProjection
-from .._rows import InverseWeights
-from .._sparse import SparseRows
+from .._base.closure import convert_closure
+from .._base.types import Args, BoolScalar, Y
+from .._constraint.correction import (
+    CorrectionEquations,
+    CorrectionRoot,
+    Crossing,
+    Normals,
+    solve_correction,
+)
+from .._constraint.settings import NewtonProjection
+from .._linalg.rows import InverseWeights
+from .._linalg.sparse import SparseRows
 from .kinematics import Kinematics
 from .mass import directions_of
 

@@ -7,12 +7,12 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, Float
 
-from .._constraint import AbstractConstraint
-from .._correction import Normals
-from .._custom_types import Args, RealScalarLike, Y
-from .._projection import NewtonProjection
-from .._projection_info import ProjectionInfo
-from .._sparse import Structure
+from .._base.types import Args, RealScalarLike, Y
+from .._constraint.constraint import AbstractConstraint
+from .._constraint.correction import Normals
+from .._constraint.projection_info import ProjectionInfo
+from .._constraint.settings import NewtonProjection
+from .._linalg.sparse import Structure
 from .constraint import MechanicalConstraint, whole_structure
 
 

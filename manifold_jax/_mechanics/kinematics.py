@@ -11,10 +11,10 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, Float
 
-from .._custom_types import Args, RealScalarLike, Y
-from .._residual import jacobian
-from .._rows import AbstractRows, Rows
-from .._sparse import Choice, choose_structure, SparseRows, Structure
+from .._base.types import Args, RealScalarLike, Y
+from .._constraint.residual import jacobian
+from .._linalg.rows import AbstractRows, Rows
+from .._linalg.sparse import Choice, choose_structure, SparseRows, Structure
 from .mass import factorize_mass, InvertedBlocks, Mass, mass_values
 
 

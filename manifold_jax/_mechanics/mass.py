@@ -10,10 +10,10 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, Float
 
-from .._custom_types import Args, BoolScalar, RealScalarLike, Y
-from .._linear import Factorization, factorize, gram, UNROLL_LIMIT
-from .._rows import InverseWeights, Rows
-from .._sparse import SparseRows
+from .._base.types import Args, BoolScalar, RealScalarLike, Y
+from .._linalg.dense import Factorization, factorize, gram, UNROLL_LIMIT
+from .._linalg.rows import InverseWeights, Rows
+from .._linalg.sparse import SparseRows
 
 
 class ConfigurationMass(eqx.Module):

@@ -10,8 +10,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._linear import Factorization
-from .._rows import combine, multiply
+from .._linalg.dense import Factorization
+from .._linalg.rows import combine, multiply
 from .mass import InvertedBlocks, Mass
 
 

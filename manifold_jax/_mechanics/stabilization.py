@@ -3,8 +3,8 @@
 import equinox as eqx
 import jax.numpy as jnp
 
-from .._custom_types import FloatScalar, RealScalarLike
-from .._stability import refuse_negative
+from .._base.types import FloatScalar, RealScalarLike
+from .._solver.stabilization import refuse_negative
 
 
 class Baumgarte(eqx.Module):

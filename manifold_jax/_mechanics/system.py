@@ -9,16 +9,15 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._constraint import AbstractConstraint
-from .._custom_types import Args, RealScalarLike, Y
-from .._directed_term import DirectedTerm
-from .._sparse import check_choice, Choice
-from .._user_function import check_function
+from .._base.types import Args, RealScalarLike, Y
+from .._base.user_functions import check_function
+from .._constraint.constraint import AbstractConstraint
+from .._linalg.sparse import check_choice, Choice
+from .._solver.terms import DirectedTerm
 from .constraint import MechanicalConstraint
 from .further import check_further_rates, ExtendedConstraint
-from .lagrangian import LagrangianForce
 from .mass import ConfigurationMass, LagrangianMass
-from .motion import Motion
+from .motion import LagrangianForce, Motion
 from .stabilization import Baumgarte, VelocityStabilization
 
 

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._custom_types import Args, RealScalarLike
+from .._base.types import Args, RealScalarLike
 from .._mechanics import MechanicalSystem
 from . import reading
 from .bodies import Bodies, Body, Pose

@@ -9,6 +9,31 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from .._base.types import Args, RealScalarLike
+from .._base.user_functions import check_function
+
+
+def check_value(word: str, value: Any, name: str, shape: tuple[int, ...]) -> Any:
+    """That of the argument `word` of the thing called `name`."""
+    if callable(value):
+        check_function(f"{word}` of `{name}", value, "f(t, args)")
+        return value
+    return check_shape(f"{name}: `{word}`", value, shape)
+
+
+def evaluate(
+    word: str,
+    values: tuple,
+    t: RealScalarLike,
+    args: Args,
+    shape: tuple[int, ...],
+    names: tuple[str, ...],
+) -> Array:
+    """All in one array `(k, *shape)`."""
+    pairs = zip(values, names, strict=True)
+    given = ((value(t, args) if callable(value) else value, name) for value, name in pairs)
+    return stack([check_shape(f"{name}: `{word}`", value, shape) for value, name in given])
+
 
 def floating(value: Any) -> Array:
     """A floating-point array; concrete ones in NumPy first, which starts no program."""

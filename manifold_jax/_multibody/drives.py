@@ -8,9 +8,9 @@ import jax.numpy as jnp
 from . import joints
 from .attachment import name_all
 from .bodies import Bodies
+from .checks import check_value
 from .equations import DRIVEN
 from .joint_groups import attachment_of, find_joint, Found, group_joints, JointGroup
-from .values import check_value
 
 
 def group_restraints(bodies: Bodies, given: Any) -> tuple[JointGroup, ...]:

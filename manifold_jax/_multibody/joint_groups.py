@@ -10,15 +10,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._custom_types import Args, RealScalarLike
+from .._base.types import Args, RealScalarLike
 from . import joints
 from .attachment import attach, Attachment
 from .bodies import Bodies, Pose
-from .checks import check_number, is_concrete, stack
+from .checks import check_number, evaluate, is_concrete, stack
 from .equations import DRIVEN, PLANAR, SPATIAL
 from .frames import Frames, Placed, with_ground
 from .rotations import length_of
-from .values import evaluate
 
 
 class JointGroup(eqx.Module):

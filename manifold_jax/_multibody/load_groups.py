@@ -7,11 +7,10 @@ import numpy as np
 from . import forces, joints
 from .attachment import attach, name_all
 from .bodies import Bodies
-from .checks import check_number, check_vector, is_concrete, stack
+from .checks import check_number, check_value, check_vector, is_concrete, stack
 from .frames import in_space
 from .joint_groups import attachment_of, find_joint, JointGroup
 from .loads import AbstractLoads, BodyLoads, JointLoads, LineLoads, SpringLaws
-from .values import check_value
 
 
 def group_forces(

@@ -8,11 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._custom_types import Args, FloatScalar, RealScalarLike
+from .._base.types import Args, FloatScalar, RealScalarLike
 from .attachment import Attachment
+from .checks import evaluate
 from .frames import Frames, in_space
 from .rotations import dot, length_of, turn
-from .values import evaluate
 
 
 Wrench = tuple[Float[Array, "n 3"], Float[Array, "n 3"]]  # forces, torques about the origins

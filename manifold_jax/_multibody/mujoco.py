@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from .._user_function import check_function
+from .._base.user_functions import check_function
 from .assembly import Assembly
 from .bodies import Pose
 from .checks import floating

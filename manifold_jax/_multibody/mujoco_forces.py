@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._custom_types import Args, RealScalarLike
+from .._base.types import Args, RealScalarLike
 from .checks import floating
 from .forces import AbstractForce, JointSpring, Motor
 from .mujoco_checks import actuator_fault, disabled

@@ -5,15 +5,7 @@ from typing import Any
 import numpy as np
 
 from .bodies import Body, GROUND
-from .joints import (
-    AbstractJoint,
-    Cylindrical,
-    Fixed,
-    Prismatic,
-    Revolute,
-    Spherical,
-    Universal,
-)
+from .joints import AbstractJoint, Cylindrical, Fixed, Prismatic, Revolute, Spherical, Universal
 from .mujoco_checks import disabled, equality_fault, Index, name_of
 
 

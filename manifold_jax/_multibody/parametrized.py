@@ -4,10 +4,9 @@ from collections.abc import Callable
 
 import equinox as eqx
 
-from .._custom_types import Args
+from .._base.types import Args
+from .._base.user_functions import AbstractOfArgs, check_function
 from .._mechanics import MechanicalSystem
-from .._of_args import AbstractOfArgs
-from .._user_function import check_function
 from .assembly import Assembly
 from .system import system_of
 

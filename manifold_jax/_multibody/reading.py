@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._custom_types import Args, FloatScalar, RealScalarLike
+from .._base.types import Args, FloatScalar, RealScalarLike
 from .bodies import Pose
 from .checks import check_vector, floating
 from .frames import Frames

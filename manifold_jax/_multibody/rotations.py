@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._custom_types import BoolScalar
+from .._base.types import BoolScalar
 from .checks import check_axis, check_number
 
 

@@ -14,7 +14,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array
 
-from .._custom_types import Args
+from .._base.types import Args
 from .bodies import check_orientation, Pose
 from .checks import check_number, check_vector, is_concrete, stack
 from .rotations import rates_matrix, rotation_matrix

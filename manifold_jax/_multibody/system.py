@@ -6,7 +6,7 @@ from typing import Any
 import equinox as eqx
 from jaxtyping import Array, Float
 
-from .._custom_types import Args, RealScalarLike
+from .._base.types import Args, RealScalarLike
 from .._mechanics import AbstractPositions, MechanicalSystem
 from .bodies import Pose
 

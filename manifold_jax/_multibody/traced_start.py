@@ -10,8 +10,8 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._custom_types import Args
-from .._linear import pseudo_invert
+from .._base.types import Args
+from .._linalg.dense import pseudo_invert
 from .bodies import Pose
 
 

@@ -21,11 +21,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._closure import convert_closure
-from .._custom_types import BoolScalar, FloatScalar, IntScalar, RealScalarLike
-from .._newton import root_of_step
-from .._projection_info import ProjectionInfo
-from .elimination import factorize_pivoted
+from .._base.closure import convert_closure
+from .._base.types import BoolScalar, FloatScalar, IntScalar, RealScalarLike
+from .._constraint.projection_info import ProjectionInfo
+from .._linalg.newton import root_of_step
+from .._linalg.pivoted import factorize_pivoted
 
 
 _MOST_ITERATIONS = 50

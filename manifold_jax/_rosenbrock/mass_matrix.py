@@ -10,14 +10,14 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, Float
 
-from .._constraint_checks import check_state
-from .._custom_types import Args, RealScalarLike, Y
-from .._diagnosis import Diagnosis
-from .._errors import clear_errors
-from .._numbers import numbers_as_arrays
-from .._projection_info import ProjectionInfo
-from .._rows import multiply
-from .._user_function import check_function
+from .._base.errors import clear_errors
+from .._base.numbers import numbers_as_arrays
+from .._base.types import Args, RealScalarLike, Y
+from .._base.user_functions import check_function
+from .._constraint.checks import check_state
+from .._constraint.diagnosis import Diagnosis
+from .._constraint.projection_info import ProjectionInfo
+from .._linalg.rows import multiply
 from .algebraic import consistent, Equations, faults_of_start
 
 

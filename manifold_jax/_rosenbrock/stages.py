@@ -7,9 +7,9 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, Float
 
-from .._custom_types import BoolScalar
-from .._traced_length import num_equations
-from .elimination import factorize_pivoted, PivotedFactorization
+from .._base.types import BoolScalar
+from .._jaxpr.trace import num_equations
+from .._linalg.pivoted import factorize_pivoted, PivotedFactorization
 from .mass_matrix import product
 from .system import System, Vector
 from .tableau import RosenbrockTableau, Row

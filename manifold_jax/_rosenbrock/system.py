@@ -8,8 +8,8 @@ import jax.flatten_util as jfu
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._compat import directed, time_direction, undirected
-from .._custom_types import Args, RealScalarLike, Y
+from .._base.compat import directed, time_direction, undirected
+from .._base.types import Args, RealScalarLike, Y
 from .mass_matrix import mass_values, MassMatrixTerm, product, ravelled_like
 
 

@@ -12,14 +12,14 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 
-from .._compat import save_y
-from .._constraint_checks import has_no_equations
-from .._custom_types import Args, RealScalarLike, Y
-from .._directed_term import DirectedTerm
+from .._base.compat import save_y
+from .._base.types import Args, RealScalarLike, Y
+from .._base.user_functions import check_function
+from .._constraint.checks import has_no_equations
 from .._solver import Stabilized
 from .._solver.base import AbstractManifoldSolver, controller_tolerances
-from .._stability import is_stable, stability_interval
-from .._user_function import check_function
+from .._solver.stabilization import is_stable, stability_interval
+from .._solver.terms import DirectedTerm
 
 
 Function = TypeVar("Function", bound=Callable)

@@ -6,12 +6,12 @@ import diffrax as dfx
 import equinox as eqx
 
 from .._adjoint import CheckedStartAdjoint, LocatingAdjoint, StepReplayAdjoint
-from .._custom_types import Args, RealScalarLike, Y
-from .._errors import clear_errors
-from .._numbers import numbers_as_arrays
-from .._of_args import evaluated
+from .._base.errors import clear_errors
+from .._base.numbers import numbers_as_arrays
+from .._base.types import Args, RealScalarLike, Y
+from .._base.user_functions import evaluated
 from .._solver.base import AbstractManifoldSolver
-from .._solver.implicit import with_tolerances_of_stages
+from .._solver.step.implicit import with_tolerances_of_stages
 from .arguments import (
     check_arguments,
     check_max_steps,

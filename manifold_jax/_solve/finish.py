@@ -3,10 +3,10 @@
 import diffrax as dfx
 from diffrax import RESULTS
 
-from .._compat import is_okay, nonlinear_failure, update_result
-from .._custom_types import Args, Y
-from .._interpolation import ManifoldInterpolation
+from .._base.compat import is_okay, nonlinear_failure, update_result
+from .._base.types import Args, Y
 from .._solver.base import AbstractManifoldSolver
+from .._solver.interpolation import ManifoldInterpolation
 from .outcome import raise_if_failed, result_of_saved, tangency_fault
 from .output import project_output
 from .start import StartInfo

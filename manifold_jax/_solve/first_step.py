@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array
 
-from .._custom_types import Args, BoolScalar, FloatScalar, RealScalarLike, Y
+from .._base.types import Args, BoolScalar, FloatScalar, RealScalarLike, Y
 
 
 class FirstStep(NamedTuple):

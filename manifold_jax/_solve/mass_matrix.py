@@ -6,8 +6,8 @@ from typing import Any
 import jax.numpy as jnp
 import jax.tree_util as jtu
 
-from .._custom_types import Args, FloatScalar, RealScalarLike, Y
-from .._diagnosis import Diagnosis
+from .._base.types import Args, FloatScalar, RealScalarLike, Y
+from .._constraint.diagnosis import Diagnosis
 from .._rosenbrock import AbstractRosenbrock, MassMatrixTerm
 from .._rosenbrock.algebraic import faults_of_start, INCONSISTENT, is_small
 from .start import Consistent

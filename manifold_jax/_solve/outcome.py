@@ -10,13 +10,13 @@ import jax.tree_util as jtu
 from diffrax import RESULTS
 from jaxtyping import Array
 
-from .._compat import messages_of_results, nonlinear_failure, number_of_result, save_y
-from .._custom_types import BoolScalar, IntScalar
-from .._projection import NewtonProjection
+from .._base.compat import messages_of_results, nonlinear_failure, number_of_result, save_y
+from .._base.types import BoolScalar, IntScalar
+from .._constraint.settings import NewtonProjection
 from .._rosenbrock import AbstractRosenbrock
 from .._solver import Projected
-from .._solver.advance import StepStatistics
 from .._solver.base import AbstractManifoldSolver
+from .._solver.step.advance import StepStatistics
 
 
 _NOT_CORRECTED = (

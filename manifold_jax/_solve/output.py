@@ -10,8 +10,8 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array
 
-from .._compat import save_y
-from .._custom_types import Args, BoolScalar, Y
+from .._base.compat import save_y
+from .._base.types import Args, BoolScalar, Y
 from .._solver.base import AbstractManifoldSolver
 
 

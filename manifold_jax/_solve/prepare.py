@@ -8,14 +8,14 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array
 
-from .._constraint_checks import check_constraint, check_state
-from .._custom_types import Args, RealScalarLike, Y
-from .._directed_term import DirectedTerm
+from .._base.types import Args, RealScalarLike, Y
+from .._constraint.checks import check_constraint, check_state
 from .._rosenbrock import MassMatrixTerm
 from .._solver import Stabilized
-from .._solver.advance import HookState
 from .._solver.base import AbstractManifoldSolver, controller_tolerances
-from .._solver.execution import execution_of, WrittenOut
+from .._solver.step.advance import HookState
+from .._solver.step.execution import execution_of, WrittenOut
+from .._solver.terms import DirectedTerm
 from .first_step import first_step, FirstStep
 from .mass_matrix import consistent_with_mass
 from .start import Consistent, start_state, StartInfo

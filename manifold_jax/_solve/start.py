@@ -5,13 +5,13 @@ from typing import Literal, NamedTuple, TypeAlias
 import jax.numpy as jnp
 import jax.tree_util as jtu
 
-from .._constraint import AbstractConstraint
-from .._custom_types import Args, BoolScalar, FloatScalar, RealScalarLike, Y
-from .._diagnosis import Diagnosis, NOT_THERE
-from .._project import consistent_state
-from .._projection import NewtonProjection
-from .._rejection import is_finite
-from .._violation import constraint_violation
+from .._base.rejection import is_finite
+from .._base.types import Args, BoolScalar, FloatScalar, RealScalarLike, Y
+from .._constraint.constraint import AbstractConstraint
+from .._constraint.diagnosis import Diagnosis, NOT_THERE
+from .._constraint.project import consistent_state
+from .._constraint.settings import NewtonProjection
+from .._constraint.violation import constraint_violation
 
 
 Consistent: TypeAlias = Literal["project", "check", "assume"]

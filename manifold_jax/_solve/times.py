@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from diffrax import RESULTS
 
-from .._custom_types import BoolScalar, IntScalar, RealScalarLike
+from .._base.types import BoolScalar, IntScalar, RealScalarLike
 
 
 Function = TypeVar("Function", bound=Callable)

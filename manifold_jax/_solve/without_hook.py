@@ -8,10 +8,10 @@ import equinox as eqx
 import jax.numpy as jnp
 import jax.tree_util as jtu
 
-from .._compat import is_okay, save_y, update_result
-from .._custom_types import Args, RealScalarLike, Y
+from .._base.compat import is_okay, save_y, update_result
+from .._base.types import Args, RealScalarLike, Y
 from .._rosenbrock import AbstractRosenbrock
-from .._solver.implicit import with_accurate_stages, with_tolerances_of_stages
+from .._solver.step.implicit import with_accurate_stages, with_tolerances_of_stages
 from .mass_matrix import consistent_with_mass, trusting
 from .outcome import raise_if_failed, result_of_saved
 from .prepare import as_state, chosen_first_step, time_dtype

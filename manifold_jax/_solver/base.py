@@ -6,12 +6,12 @@ from typing import Any
 import diffrax as dfx
 import equinox as eqx
 
-from .._compat import is_sde, undirected
-from .._constraint import AbstractConstraint
-from .._constraint_checks import check_constraint_type
-from .._custom_types import Args, RealScalarLike, Y
-from .._projection import NewtonProjection
-from .._projection_info import ProjectionInfo
+from .._base.compat import is_sde, undirected
+from .._base.types import Args, RealScalarLike, Y
+from .._constraint.checks import check_constraint_type
+from .._constraint.constraint import AbstractConstraint
+from .._constraint.projection_info import ProjectionInfo
+from .._constraint.settings import NewtonProjection
 from .._rosenbrock import AbstractRosenbrock, MassMatrixTerm
 
 

@@ -9,25 +9,20 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from diffrax import RESULTS
 
-from .._chart import (
-    AbstractChart,
-    AbstractCoordinates,
-    check_state_like,
-    TangentSpaceChart,
-)
-from .._compat import is_sde, time_direction
-from .._constraint import AbstractConstraint
-from .._constraint_checks import check_constraint
-from .._custom_types import Args, BoolScalar, RealScalarLike, Y
-from .._interpolation import CorrectedInterpolationFactory
-from .._projection import NewtonProjection
-from .._projection_info import ProjectionInfo
-from .advance import conclude, HookState
+from .._base.compat import is_sde, time_direction
+from .._base.types import Args, BoolScalar, RealScalarLike, Y
+from .._constraint.checks import check_constraint
+from .._constraint.constraint import AbstractConstraint
+from .._constraint.projection_info import ProjectionInfo
+from .._constraint.settings import NewtonProjection
 from .base import AbstractManifoldSolver, check_hook_arguments, check_no_mass_matrix, check_noise
-from .execution import execution_of, Step
-from .frame import Frame
-from .implicit import with_accurate_stages
-from .rewrite import rewrite_terms, RewrittenTerm
+from .chart import AbstractChart, AbstractCoordinates, check_state_like, TangentSpaceChart
+from .interpolation import CorrectedInterpolationFactory
+from .step.advance import conclude, HookState
+from .step.execution import execution_of, Step
+from .step.frame import Frame
+from .step.implicit import with_accurate_stages
+from .terms import rewrite_terms, RewrittenTerm
 
 
 class LocalCoordinates(AbstractManifoldSolver):

@@ -5,17 +5,17 @@ from typing import Any, ClassVar
 import diffrax as dfx
 from diffrax import RESULTS
 
-from .._compat import time_direction
-from .._constraint import AbstractConstraint
-from .._constraint_checks import check_constraint
-from .._custom_types import Args, RealScalarLike, Y
-from .._interpolation import CorrectedInterpolationFactory
-from .._projection import NewtonProjection
-from .advance import conclude, HookState
+from .._base.compat import time_direction
+from .._base.types import Args, RealScalarLike, Y
+from .._constraint.checks import check_constraint
+from .._constraint.constraint import AbstractConstraint
+from .._constraint.settings import NewtonProjection
 from .base import AbstractManifoldSolver, check_hook_arguments, check_noise
-from .execution import execution_of
-from .frame import Frame
-from .implicit import with_accurate_stages
+from .interpolation import CorrectedInterpolationFactory
+from .step.advance import conclude, HookState
+from .step.execution import execution_of
+from .step.frame import Frame
+from .step.implicit import with_accurate_stages
 
 
 class Projected(AbstractManifoldSolver):

@@ -6,22 +6,21 @@ import diffrax as dfx
 import jax.numpy as jnp
 from diffrax import RESULTS
 
-from .._compat import is_sde, time_direction, update_result
-from .._constraint import AbstractConstraint
-from .._constraint_checks import check_constraint
-from .._custom_types import Args, RealScalarLike, Y
-from .._interpolation import CorrectedInterpolationFactory
-from .._projection import NewtonProjection
-from .._projection_info import ProjectionInfo
-from .._rejection import result_of_state
-from .._stability import is_stable
-from .._stabilization import AbstractStabilization
-from .advance import conclude, HookState
+from .._base.compat import is_sde, time_direction, update_result
+from .._base.rejection import result_of_state
+from .._base.types import Args, RealScalarLike, Y
+from .._constraint.checks import check_constraint
+from .._constraint.constraint import AbstractConstraint
+from .._constraint.projection_info import ProjectionInfo
+from .._constraint.settings import NewtonProjection
 from .base import AbstractManifoldSolver, check_hook_arguments, check_no_mass_matrix
-from .execution import execution_of
-from .frame import Frame
-from .implicit import with_accurate_stages
-from .rewrite import has_several, rewrite_terms, RewrittenTerm
+from .interpolation import CorrectedInterpolationFactory
+from .stabilization import AbstractStabilization, is_stable
+from .step.advance import conclude, HookState
+from .step.execution import execution_of
+from .step.frame import Frame
+from .step.implicit import with_accurate_stages
+from .terms import has_several, rewrite_terms, RewrittenTerm
 
 
 class Stabilized(AbstractManifoldSolver):

@@ -8,7 +8,7 @@ import scipy.linalg
 import scipy.sparse as sp
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
-from ._reduced import integrate
+from ._problem import integrate
 
 
 class Rods(NamedTuple):

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._custom_types import FloatScalar, RealScalarLike
+from .._base.types import FloatScalar, RealScalarLike
 from .._mechanics import MechanicalSystem
 from ._problem import Problem, require_standard
 

@@ -7,10 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._custom_types import RealScalarLike
+from .._base.types import RealScalarLike
 from .._mechanics import MechanicalSystem
-from ._problem import as_floating, Problem
-from ._reduced import integrate
+from ._problem import as_floating, integrate, Problem
 
 
 State: TypeAlias = tuple[Float[Array, " n"], Float[Array, " n"]]

@@ -7,18 +7,9 @@ from typing import Any, NamedTuple, TypeAlias
 import jax.numpy as jnp
 import numpy as np
 
-from .._multibody import (
-    Assembly,
-    Body,
-    Distance,
-    GROUND,
-    JointSpring,
-    Pose,
-    Revolute,
-)
+from .._multibody import Assembly, Body, Distance, GROUND, JointSpring, Pose, Revolute
 from .._multibody.parametrized import parametrized
-from ._problem import as_floating, Problem
-from ._reduced import integrate
+from ._problem import as_floating, integrate, Problem
 
 
 State: TypeAlias = tuple[Pose, Pose]

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._custom_types import RealScalarLike
+from .._base.types import RealScalarLike
 from .._mechanics import MechanicalSystem
 from ._problem import as_floating, Problem
 

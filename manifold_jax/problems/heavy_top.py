@@ -8,10 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._custom_types import FloatScalar, RealScalarLike
+from .._base.types import FloatScalar, RealScalarLike
 from .._mechanics import MechanicalSystem
-from ._problem import as_floating, Problem
-from ._reduced import integrate
+from ._problem import as_floating, integrate, Problem
 
 
 Vector: TypeAlias = Float[Array, "4"]

@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._constraint import Invariants
-from .._custom_types import FloatScalar, RealScalarLike
+from .._base.types import FloatScalar, RealScalarLike
+from .._constraint.constraint import Invariants
 from ._problem import Problem, require_standard
 
 

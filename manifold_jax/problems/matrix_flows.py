@@ -11,8 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._constraint import Constraint
-from .._custom_types import FloatScalar, RealScalarLike
+from .._base.types import FloatScalar, RealScalarLike
+from .._constraint.constraint import Constraint
 from .._lie_groups import LieGroupChart, SO3
 from ._problem import as_floating, Problem
 

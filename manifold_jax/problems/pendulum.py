@@ -9,7 +9,7 @@ import scipy.special
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
-from .._custom_types import FloatScalar, RealScalarLike
+from .._base.types import FloatScalar, RealScalarLike
 from .._mechanics import MechanicalSystem
 from ._problem import as_floating, Problem
 

@@ -9,8 +9,8 @@ import numpy as np
 import scipy.special
 from jaxtyping import Array, Float
 
-from .._constraint import Invariants
-from .._custom_types import RealScalarLike
+from .._base.types import RealScalarLike
+from .._constraint.constraint import Invariants
 from ._problem import as_floating, Problem
 
 

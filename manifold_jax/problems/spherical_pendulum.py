@@ -6,10 +6,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._custom_types import FloatScalar, RealScalarLike
+from .._base.types import FloatScalar, RealScalarLike
 from .._mechanics import MechanicalSystem
-from ._problem import Problem
-from ._reduced import integrate
+from ._problem import integrate, Problem
 
 
 Vector: TypeAlias = Float[Array, "3"]

@@ -6,19 +6,9 @@ from typing import Any, NamedTuple, TypeAlias
 import jax.numpy as jnp
 import numpy as np
 
-from .._multibody import (
-    Assembly,
-    Body,
-    GROUND,
-    JointSpring,
-    Pose,
-    Prismatic,
-    Spherical,
-    Universal,
-)
+from .._multibody import Assembly, Body, GROUND, JointSpring, Pose, Prismatic, Spherical, Universal
 from .._multibody.parametrized import parametrized
-from ._problem import as_floating, Problem
-from ._reduced import integrate
+from ._problem import as_floating, integrate, Problem
 
 
 State: TypeAlias = tuple[Pose, Pose]

@@ -1,0 +1,1 @@
+"""Names that all other folders use: types, what is taken from Diffrax, errors, derivative rules."""

@@ -1,0 +1,186 @@
+"""The only file that touches private names of Diffrax and Equinox.
+
+Seen in Diffrax 0.7.2 and Equinox 0.13.8; each name has a test that fails when it moves.
+"""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax.tree_util as jtu
+from diffrax import AbstractTerm, MultiTerm, RESULTS
+from diffrax._heuristics import (
+    is_sde as is_sde,  # which terms are driven by Brownian motion
+    is_unsafe_sde as is_unsafe_sde,  # by one that cannot be evaluated twice
+)
+from diffrax._integrate import (
+    loop as diffrax_loop,  # what an adjoint has to run  # noqa: F401
+    SaveState as SaveState,  # what has been saved so far
+    State as LoopState,  # what a solve carries from step to step
+)
+from diffrax._root_finder import (
+    use_stepsize_tol as use_stepsize_tol,  # marks tolerances that are to be those of the steps
+)
+from diffrax._saveat import save_y as save_y  # marks "save the state itself" in SubSaveAt.fn
+from diffrax._solution import (
+    is_okay as is_okay,  # successful or stopped by an event
+    update_result as update_result,  # first failure wins
+)
+from diffrax._term import WrapTerm
+from equinox.internal import (
+    buffer_at_set as buffer_at_set,  # writes in place, also under vmap
+    MaybeBuffer as MaybeBuffer,  # an array, or one that a loop writes to in place
+    nondifferentiable as nondifferentiable,
+    unvmap_any as unvmap_any,  # over all lanes of a batch
+    unvmap_max as unvmap_max,
+    while_loop as while_loop,  # Diffrax's loops take its arguments
+)
+from jaxtyping import PyTree
+
+from .types import RealScalarLike
+
+
+def time_direction(terms: PyTree) -> RealScalarLike:
+    """`1` or `-1`: Diffrax integrates `t1 < t0` in negated time and says so only here.
+
+    A solver's `step` sees the negated times; the true time is `t * time_direction(terms)`.
+    Terms that were never wrapped (manual stepping) run in true time.
+    """
+    leaves = jtu.tree_leaves(terms, is_leaf=lambda x: isinstance(x, WrapTerm))
+    for leaf in leaves:
+        if isinstance(leaf, WrapTerm):
+            return leaf.direction
+    return 1
+
+
+def directed(terms: PyTree, direction: RealScalarLike) -> PyTree:
+    """Terms in the time in which Diffrax integrates, `t * direction`."""
+    is_leaf = lambda x: isinstance(x, AbstractTerm) and not isinstance(x, MultiTerm)
+    return jtu.tree_map(lambda term: WrapTerm(term, direction), terms, is_leaf=is_leaf)  # pyright: ignore[reportArgumentType]
+
+
+def undirected(terms: PyTree) -> PyTree:
+    """Terms as the user wrote them, if Diffrax has wrapped them."""
+    return terms.term if isinstance(terms, WrapTerm) else terms
+
+
+def nonlinear_failure() -> RESULTS:
+    """The result code of a constraint that could not be satisfied.
+
+    Result codes cannot be added from outside Diffrax; this is what its implicit solvers
+    return when their equations cannot be solved.
+    """
+    return RESULTS.nonlinear_divergence  # pyright: ignore[reportReturnType]
+
+
+def number_of_result(result: RESULTS) -> Any:
+    """The number by which a result code is stored."""
+    return result._value  # pyright: ignore
+
+
+def messages_of_results() -> list[str]:
+    """The messages of all result codes, by number."""
+    return list(RESULTS._index_to_message)  # pyright: ignore
+
+
+def save_states(state: LoopState) -> list[SaveState]:
+    """What a solve has saved so far, one per `SubSaveAt`."""
+    is_save_state = lambda x: isinstance(x, SaveState)
+    leaves = jtu.tree_leaves(state.save_state, is_leaf=is_save_state)
+    return [leaf for leaf in leaves if is_save_state(leaf)]
+
+
+def with_result(state: LoopState, result: RESULTS) -> LoopState:
+    """A solve that ends with this result before its next step, unless it is "successful"."""
+    return eqx.tree_at(lambda s: s.result, state, update_result(state.result, result))
+
+
+def with_next_time(state: LoopState, tnext: Any) -> LoopState:
+    """A solve whose next step ends there."""
+    return eqx.tree_at(lambda s: s.tnext, state, tnext)
+
+
+class Progress(NamedTuple):
+    """How far a solve is: where its next step begins and ends, from what, and how many there were."""
+
+    tprev: Any
+    tnext: Any
+    made_jump: Any
+    y: Any
+    solver_state: Any
+    num_steps: Any
+    num_accepted_steps: Any
+
+    @staticmethod
+    def of(state: LoopState) -> "Progress":
+        return Progress(*(getattr(state, name) for name in Progress._fields))
+
+
+class Ending(NamedTuple):
+    """How a solve ended."""
+
+    event_mask: Any
+    save_state: Any
+    result: RESULTS
+
+    @staticmethod
+    def of(state: LoopState) -> "Ending":
+        return Ending(state.event_mask, state.save_state, state.result)
+
+    def put_into(self, state: LoopState) -> LoopState:
+        return eqx.tree_at(lambda s: (s.event_mask, s.save_state, s.result), state, tuple(self))
+
+
+class LastStep(NamedTuple):
+    """The step in which an event happened, with the conditions behind it."""
+
+    start: Any
+    end: Any
+    dense_info: Any
+    values: Any
+    mask: Any
+
+    @staticmethod
+    def of(state: LoopState) -> "LastStep":
+        times = state.event_tprev, state.event_tnext
+        return LastStep(*times, state.event_dense_info, state.event_values, state.event_mask)
+
+
+class Differentiable(NamedTuple):
+    """What has derivatives of the final state of a loop: not its statistics, and not the state of
+    the step size controller."""
+
+    ts: list[Any]
+    ys: list[Any]
+    dense_ts: Any
+    dense_infos: Any
+    event_dense_info: Any
+    y: Any
+    solver_state: Any
+
+    @staticmethod
+    def of(state: LoopState) -> "Differentiable":
+        saved = save_states(state)
+        dense = state.dense_ts, state.dense_infos, state.event_dense_info
+        rows = [s.ts for s in saved], [s.ys for s in saved]
+        return Differentiable(*rows, *dense, state.y, state.solver_state)
+
+    def put_into(self, state: LoopState) -> LoopState:
+        replaced = lambda where, tree, new: eqx.tree_at(
+            where, tree, new, is_leaf=lambda x: x is None
+        )
+        rows = zip(save_states(state), self.ts, self.ys, strict=True)
+        saved = [replaced(lambda s: (s.ts, s.ys), s, new) for s, *new in rows]
+        parts = lambda s: (s.dense_ts, s.dense_infos, s.event_dense_info, s.y, s.solver_state)
+        return replaced(parts, eqx.tree_at(save_states, state, saved), self[2:])
+
+
+def scan_counts(equation: Any) -> tuple[int, int]:
+    """Of a traced `lax.scan`, how many of its inputs are constants and how many are carried. JAX 0.12 has no
+    parameters that say so; what is scanned over has one axis less in the body."""
+    body = getattr(equation.params["jaxpr"], "jaxpr", equation.params["jaxpr"])
+    scanned = lambda outer, inner: sum(
+        a.aval.ndim > b.aval.ndim for a, b in zip(outer, inner, strict=True)
+    )
+    num_carry = len(equation.outvars) - scanned(equation.outvars, body.outvars)
+    num_scanned = scanned(equation.invars, body.invars)
+    return len(equation.invars) - num_carry - num_scanned, num_carry

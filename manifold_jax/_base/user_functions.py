@@ -1,0 +1,61 @@
+"""Functions of the user: refused where they are given, and evaluated once where they depend on `args` alone."""
+
+import abc
+import inspect
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax.tree_util as jtu
+
+from .types import Args
+
+
+class AbstractOfArgs(eqx.Module):
+    """A function of the args alone, called by vector fields and constraints in every evaluation."""
+
+    function: eqx.AbstractVar[Callable]
+
+    @abc.abstractmethod
+    def __call__(self, args: Args) -> Any:
+        """The same for the same args."""
+
+
+def evaluated(tree: Any, args: Args) -> Any:
+    """`tree` with every [`AbstractOfArgs`][] in it replaced by its value at these args. Inside a loop
+    it would be part of every program that needs it: of stages, corrections and their derivatives.
+
+    The value is closed over, and so is one input, however often the function is there.
+    """
+    found: dict[int, Callable] = {}
+
+    def replaced(leaf: Any) -> Any:
+        if not isinstance(leaf, AbstractOfArgs):
+            return leaf
+        if id(leaf.function) not in found:
+            value = leaf(args)
+            found[id(leaf.function)] = lambda args: value
+        return found[id(leaf.function)]
+
+    return jtu.tree_map(replaced, tree, is_leaf=lambda leaf: isinstance(leaf, AbstractOfArgs))
+
+
+def check_function(name: str, function: Any, call: str, *keywords: str, advice: str = "") -> None:
+    """Refuse what cannot be called like `call`, for example `g(t, y, args)`: with that many
+    arguments, and `keywords` for a `**kwargs` at their end."""
+    if not callable(function):
+        advice = f" {advice}" if advice else ""
+        raise TypeError(
+            f"`{name}` must be a callable `{call}`, got {type(function).__name__}.{advice}"
+        )
+    try:
+        signature = inspect.signature(function)
+    except (TypeError, ValueError):  # some that are not written in Python have none
+        return
+    arguments = call[call.index("(") + 1 : -1].removesuffix(", **kwargs").split(", ")
+    try:
+        signature.bind(*arguments, **dict.fromkeys(keywords))
+    except TypeError as error:
+        raise TypeError(
+            f"`{name}` must be a callable `{call}`, got one with the arguments `{signature}`: {error}."
+        ) from None

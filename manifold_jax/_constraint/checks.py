@@ -1,0 +1,114 @@
+"""States and constraints of the wrong kind or shape, refused while tracing."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+
+from .._base.types import Args, RealScalarLike, Y
+from .constraint import AbstractConstraint
+
+
+def check_state(y: Y, name: str = "y0") -> None:
+    """Refuse, while tracing, states that are not pytrees of real floating-point arrays."""
+    if any(_is_list_of_numbers(node) for node in jtu.tree_leaves(y, is_leaf=_is_list_of_numbers)):
+        raise TypeError(
+            f"`{name}` has a list of numbers, of which JAX makes as many states as there are numbers. Make it one "
+            f"array: `{name} = jnp.array([...], float)`."
+        )
+    leaves = jtu.tree_leaves(y)
+    if len(leaves) == 0:
+        raise ValueError(
+            f"`{name}` has no array leaves: pass the state as a pytree of real arrays."
+        )
+    for leaf in leaves:
+        if not eqx.is_array_like(leaf):
+            raise TypeError(
+                f"`{name}` must be a pytree of real arrays, but has a leaf of type {type(leaf).__name__}."
+            )
+        dtype = jnp.result_type(leaf)
+        if jnp.issubdtype(dtype, jnp.complexfloating):
+            raise TypeError(
+                f"`{name}` has a complex leaf ({dtype}). Integrate its real and imaginary parts: "
+                f"pass e.g. `{name}=(z.real, z.imag)` and write the vector field and the constraint for them."
+            )
+        if not jnp.issubdtype(dtype, jnp.floating):
+            raise TypeError(
+                f"`{name}` has a leaf of type {dtype}, which cannot be moved onto a manifold. "
+                f"Convert it: `{name} = jax.tree.map(lambda leaf: jnp.asarray(leaf, float), {name})`."
+            )
+
+
+def _is_list_of_numbers(node: Any) -> bool:
+    is_number = lambda x: eqx.is_array_like(x) and jnp.ndim(x) == 0
+    return isinstance(node, list) and len(node) > 0 and all(map(is_number, node))
+
+
+def check_constraint_type(constraint: Any) -> None:
+    if isinstance(constraint, AbstractConstraint):
+        return
+    got = f"`constraint` must be an `mj.Constraint`, got {type(constraint).__name__}."
+    if isinstance(getattr(constraint, "constraint", None), AbstractConstraint):
+        raise TypeError(f"{got} Pass its manifold: `system.constraint`.")
+    if callable(constraint):
+        raise TypeError(f"{got} Wrap a residual function: `mj.Constraint(lambda t, y, args: ...)`.")
+    raise TypeError(f"{got} The constraint comes first: `(constraint, t, y, args)`.")
+
+
+def has_no_equations(constraint: AbstractConstraint, t: RealScalarLike, y: Y, args: Args) -> bool:
+    """Whether every state satisfies it. Of a constraint that cannot be evaluated
+    [`check_constraint`][] says why."""
+    try:
+        leaves = jtu.tree_leaves(eqx.filter_eval_shape(constraint, t, y, args))
+    except Exception:
+        return False
+    return len(leaves) > 0 and all(getattr(leaf, "size", 1) == 0 for leaf in leaves)
+
+
+def check_constraint(constraint: AbstractConstraint, t: RealScalarLike, y: Y, args: Args) -> int:
+    """Refuse, while tracing, constraints of the wrong type or shape; returns `m`."""
+    check_constraint_type(constraint)
+    try:
+        out = eqx.filter_eval_shape(constraint, t, y, args)
+    except Exception as error:
+        if isinstance(error, TypeError) and ("cond" in str(error) or "branch" in str(error)):
+            raise TypeError(
+                "`constraint` must return the same number of equations in every branch of `jax.lax.cond` or "
+                "`jax.lax.switch`; multiply an equation that is switched off by zero."
+            ) from error
+        shapes = jtu.tree_map(jnp.shape, y)
+        error.add_note(
+            f"This is what `constraint` said of a state of shapes {shapes}. Is it one state, as the function expects "
+            "it? Saved states need their times: `mj.constraint_violation(constraint, sol.ts, sol.ys, args)`."
+        )
+        raise
+    leaves = jtu.tree_leaves(out)
+    for leaf in leaves:
+        if not isinstance(leaf, jax.ShapeDtypeStruct | float):
+            raise TypeError(
+                "`constraint` must return a pytree of real arrays, but its residual has a leaf of type "
+                f"{type(leaf).__name__}. Return e.g. `jnp.stack([g1, g2])`."
+            )
+        if isinstance(leaf, jax.ShapeDtypeStruct) and not jnp.issubdtype(leaf.dtype, jnp.floating):
+            raise TypeError(
+                f"`constraint` returned a residual of type {leaf.dtype}; it must be real floating-point. "
+                "For complex equations return their real and imaginary parts."
+            )
+    if not leaves:
+        raise ValueError("`constraint` returned no residual at all: is its `return` missing?")
+    m = sum(leaf.size if isinstance(leaf, jax.ShapeDtypeStruct) else 1 for leaf in leaves)
+    n = sum(jnp.size(leaf) for leaf in jtu.tree_leaves(y))
+    if m == 0:
+        raise ValueError(
+            "`constraint` returned an empty residual; without constraints use the solver alone, or `mj.diffeqsolve`, "
+            "which does so."
+        )
+    if m > n and not constraint.redundant:
+        raise ValueError(
+            f"`constraint` returned {m} residuals for a state of {n} numbers; at most {n} independent "
+            "equations can hold. Remove dependent rows (of a symmetric matrix equation keep the upper triangle), "
+            "or pass `redundant=True`."
+        )
+    return m

@@ -1,0 +1,244 @@
+"""Correction of one point onto the manifold of any residual (the paper's perturbation approach).
+
+The corrected point is `p = x + V z` with directions `V` (shape `(n, m)`, held as the rows of `V^T`)
+that are fixed at the point `x` that is corrected, and `z` the root of `g(t, x + V z, args) = 0`.
+"""
+
+import dataclasses
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.flatten_util as jfu
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from .._base.closure import convert_closure
+from .._base.derivative_rule import ForwardRule
+from .._base.types import Args, BoolScalar, FloatScalar, IntScalar, RealScalarLike, Y
+from .._linalg.dense import factorize_once, gram, pseudo_invert
+from .._linalg.newton import AbstractEquations, chord, damped_newton, implicit_tangent
+from .._linalg.rows import AbstractRows, combine, InverseWeights, Rows
+from .._linalg.sparse import SparseRows, Structure
+from .residual import as_time, jacobian, residual_vector, row_scale
+from .settings import NewtonProjection
+
+
+class Normals(NamedTuple):
+    """What leads across the manifold at a point: the Jacobian `G`, and the directions, the rows of
+    `V^T`, along which points nearby are corrected, by default `V = W^-1 G^T`. Both `(m, k)` for
+    `k` components that are moved together, by default the `n` of the state."""
+
+    jacobian: Rows
+    directions: Rows
+
+
+class Crossing(NamedTuple):
+    """The normals at a point with `G V` factored: the linearization of a correction."""
+
+    normals: Normals
+    factorization: Any  # Factorization | Inverse | PseudoInverse, or that of sparse rows
+
+    @staticmethod
+    def of(normals: Normals, redundant: bool, dependent: FloatScalar | float = 1e-4) -> "Crossing":
+        """`dependent` as in `pseudo_invert`, for `redundant` equations."""
+        if isinstance(normals.jacobian, AbstractRows):
+            return Crossing(normals, normals.jacobian.factorize(normals.directions))
+        A = gram(*normals)
+        if not redundant:
+            return Crossing(normals, factorize_once(A))
+        return Crossing(normals, pseudo_invert(A, equilibrated=True, dependent=dependent))
+
+    def solve(self, b: Float[Array, " m"]) -> Float[Array, " m"]:
+        return self.factorization.solve(b)
+
+
+def _dependent(ratio: FloatScalar) -> FloatScalar:
+    return jax.lax.stop_gradient(jnp.clip(ratio, 1e4 * jnp.finfo(ratio.dtype).eps, 1e-4))
+
+
+class CorrectionEquations(AbstractEquations):
+    """`g(t, x + V z, args) = 0` in the multipliers `z`; `V = W^-1 G(x)^T` unless given. With a
+    `structure`, `G` is not held as an array."""
+
+    function: Any  # (t, x, args)
+    t: Array
+    x: Float[Array, " n"]
+    args: Args
+    inverse_metric: Float[Array, " n"] | None = None
+    directions: Rows | None = None
+    redundant: bool = eqx.field(static=True, default=False)
+    structure: Structure | None = eqx.field(static=True, default=None)
+
+    def residual(self, x: Float[Array, " n"]) -> Float[Array, " m"]:
+        return self.function(self.t, x, self.args)
+
+    def point(self, z: Float[Array, " m"]) -> Float[Array, " n"]:
+        """`x + V z` without forming `V`, so that its derivative does not either."""
+        if self.directions is not None:
+            return self.x + combine(z, self.directions)
+        _, pullback = jax.vjp(self.residual, self.x)
+        (d,) = pullback(z)
+        return self.x + (d if self.inverse_metric is None else self.inverse_metric * d)
+
+    def linearize(self, x: Float[Array, " n"]) -> Crossing:
+        if isinstance(self.directions, AbstractRows):
+            rows = self.directions.of_other(self.function, self.t, x, self.args)
+            return Crossing.of(Normals(rows, self.directions), self.redundant)
+        G = self._rows(x)
+        if self.directions is not None:
+            return Crossing.of(Normals(G, self.directions), self.redundant)
+        at_start = self.normals()
+        # `G V` of two points, whose dependence differs by the distance between them.
+        dependent = _dependent(1e3 * self.level(at_start)) if self.redundant else 0.0
+        return Crossing.of(Normals(G, at_start.directions), self.redundant, dependent)
+
+    def crossing(self) -> Crossing:
+        """At the point that is corrected."""
+        normals = self.normals()
+        # Equations that depend on each other on the manifold do so beside it up to the distance.
+        dependent = _dependent(1e6 * self.level(normals) ** 2) if self.redundant else 0.0
+        return Crossing.of(normals, self.redundant, dependent)
+
+    def normals(self) -> Normals:
+        G = self._rows(self.x)
+        if self.directions is not None:
+            return Normals(G, self.directions)
+        if self.inverse_metric is None:
+            return Normals(G, G)
+        metric = InverseWeights(self.inverse_metric)
+        return Normals(G, G.along(metric) if isinstance(G, SparseRows) else metric.solve(G))
+
+    def _rows(self, x: Float[Array, " n"]) -> Rows:
+        if self.structure is None:
+            return jacobian(self.residual, x)[1]
+        return SparseRows(self.function, self.t, x, self.args, self.structure)
+
+    def level(self, normals: Normals) -> FloatScalar:
+        """How far from the manifold the point is."""
+        return jnp.max(jnp.abs(self.residual(self.x)) / row_scale(normals.jacobian, self.x))
+
+    def starting_at(self, x: Float[Array, " n"]) -> "CorrectionEquations":
+        return dataclasses.replace(self, x=x)
+
+    def along(self, directions: Rows) -> "CorrectionEquations":
+        return dataclasses.replace(self, directions=directions)
+
+
+class CorrectionRoot(NamedTuple):
+    """The corrected point, its multipliers, and how it went."""
+
+    p: Float[Array, " n"]
+    z: Float[Array, " m"]
+    iterations: IntScalar
+    residual: FloatScalar
+    full_rank: BoolScalar
+    success: BoolScalar
+
+
+def solve_correction(
+    equations: CorrectionEquations,
+    safe: Float[Array, " n"],
+    projection: NewtonProjection,
+    far: bool,
+    crossing: Crossing | None = None,
+) -> CorrectionRoot:
+    """The root that the settings in `projection` lead to.
+
+    The derivative of a failed correction is taken at `safe`. Corrections that share a
+    Jacobian and its factorization pass them on as `crossing`.
+    """
+    if projection.max_steps == 1 and not far:
+        return _correct_once(equations, safe, crossing)
+    tolerance = projection.tolerance_for(equations.x.dtype)
+    return _solve(equations, safe, projection.max_steps, tolerance, far, crossing)
+
+
+def _correct_once(
+    equations: CorrectionEquations, safe: Float[Array, " n"], crossing: Crossing | None
+) -> CorrectionRoot:
+    """One Newton step, `x - V (G V)^-1 g(x)`, successful if it lowers the residual.
+
+    Differentiated as it stands: it is a map of its own, not an approximation of the root.
+    """
+    finite = jnp.all(jnp.isfinite(equations.x))
+    equations = equations.starting_at(jnp.where(finite, equations.x, safe))
+    if crossing is None:
+        crossing = equations.crossing()
+    (G, directions), factorization = crossing
+    scale = row_scale(G, equations.x)
+    r = equations.residual(equations.x)
+    z = -factorization.solve(r)
+    p = equations.x + combine(z, directions)
+    before, after = (jnp.max(jnp.abs(x) / scale) for x in (r, equations.residual(p)))
+    rounding = 50 * jnp.finfo(r.dtype).eps
+    success = finite & factorization.full_rank & (after <= jnp.maximum(before, rounding))
+    p = jnp.where(success, p, equations.x)
+    residual = jnp.where(finite, after, jnp.nan)
+    one = jnp.ones((), jnp.int32)
+    return CorrectionRoot(p, z, one, residual, factorization.full_rank, success)
+
+
+@ForwardRule
+def _solve(
+    equations: CorrectionEquations,
+    safe: Float[Array, " n"],
+    max_steps: int,
+    tolerance: Any,
+    far: bool,
+    crossing: Crossing | None,
+) -> CorrectionRoot:
+    del safe
+    if crossing is None:
+        crossing = equations.crossing()
+    (G, directions), factorization = crossing
+    r = equations.residual(equations.x)
+    fixed, scale, z = equations.along(directions), row_scale(G, equations.x), jnp.zeros_like(r)
+    if far:
+        root = damped_newton(fixed, z, r, scale, max_steps, tolerance)
+    else:
+        root = chord(fixed, crossing, z, r, scale, max_steps)
+    full_rank = factorization.full_rank
+    success = (root.level <= tolerance) & full_rank
+    p = jnp.where(success, fixed.point(root.z), equations.x)
+    return CorrectionRoot(p, root.z, root.iterations, root.level, full_rank, success)
+
+
+@_solve.define_jvp
+def _solve_jvp(root, primals, tangents):
+    equations, safe, *_ = primals
+    # A failed projection may have met NaN. Move to a point where g is finite *before*
+    # differentiating: selecting afterwards would leave 0 * NaN in reverse mode.
+    equations = equations.starting_at(jnp.where(root.success, equations.x, safe))
+    z = jnp.where(root.success, root.z, 0)
+    dz, moved, crossing = implicit_tangent(equations, tangents[0], z)
+    p_dot = moved + combine(dz, crossing.normals.directions)  # pyright: ignore[reportAttributeAccessIssue]
+    return CorrectionRoot(p_dot, dz, None, jnp.zeros_like(root.residual), None, None)  # pyright: ignore[reportArgumentType]
+
+
+def equations_of(
+    function: Any,
+    t: RealScalarLike,
+    y: Y,
+    args: Args,
+    projection: NewtonProjection,
+    redundant: bool,
+    directions: Float[Array, "m n"] | None = None,
+    structure: Structure | None = None,
+) -> CorrectionEquations:
+    """Those of the residual `function(t, y, args)` of a whole state."""
+    x, unravel = jfu.ravel_pytree(y)
+    t = as_time(t, x.dtype)
+    # Parameters that the residual closes over become inputs, so that they are differentiated.
+    residual = convert_closure(
+        lambda t, x, args: residual_vector(function, t, unravel(x), args), t, x, args
+    )
+    metric = projection.inverse_metric_without_masses(y)
+    return CorrectionEquations(residual, t, x, args, metric, directions, redundant, structure)
+
+
+def without_normal_part(
+    normals: Normals, e: Float[Array, " k"], rate: Float[Array, " m"], redundant: bool = False
+) -> Float[Array, " k"]:
+    """`e - V (G V)^-1 rate`, tangent if `rate = G e`."""
+    return e - combine(Crossing.of(normals, redundant).solve(rate), normals.directions)

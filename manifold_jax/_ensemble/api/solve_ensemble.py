@@ -1,0 +1,148 @@
+"""The front end of ensembles."""
+
+import dataclasses
+from typing import Any
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from jax.sharding import Mesh
+from jaxtyping import Array
+
+from ..._adjoint import StepReplayAdjoint
+from ..._base.errors import clear_errors
+from ..._base.numbers import numbers_as_arrays
+from ..._base.types import Args, RealScalarLike, Y
+from ..._solve.arguments import check_arguments, fault_of_field, warn_of_rounding, without_idle_hook
+from ..._solve.start import Consistent
+from ..._solve.times import checking_first_step
+from ..lanes.arguments import (
+    anywhere,
+    Axes,
+    Batch,
+    checked_batch,
+    checked_step,
+    checked_times,
+    largest,
+)
+from ..lanes.execution import solve_on_one_device
+from ..lanes.parts import Inputs
+from ..lanes.solution import EnsembleSolution, messages_of
+from ..lanes.trajectory import Equations
+from .devices import check_mesh, over_devices
+
+
+@clear_errors
+@checking_first_step
+@numbers_as_arrays("y0s", "args", times=("t0", "t1", "dt0"))
+@eqx.filter_jit
+def solve_ensemble(
+    terms: dfx.AbstractTerm,
+    solver: dfx.AbstractSolver,
+    t0: RealScalarLike | Array,
+    t1: RealScalarLike | Array,
+    dt0: RealScalarLike | None,
+    y0s: Y,
+    args: Args = None,
+    *,
+    saveat: dfx.SaveAt = dfx.SaveAt(t1=True),
+    stepsize_controller: dfx.AbstractStepSizeController = dfx.ConstantStepSize(),
+    max_steps: int = 4096,
+    in_axes: Any = 0,
+    lanes: int = 128,
+    adjoint: dfx.AbstractAdjoint = StepReplayAdjoint(),
+    mesh: Mesh | None = None,
+    throw: bool = False,
+    consistent: Consistent = "project",
+) -> EnsembleSolution:
+    """Solve a differential equation on a manifold for many initial values and parameters.
+
+    Each trajectory is that of [`diffeqsolve`][], to rounding: the same accepted steps, and on the
+    manifold at every value handed out. `lanes` of them advance together, with steps of their own; one
+    that has ended, or failed, makes room for the next at once, so that none waits for the
+    longest. Every component of the state is a vector of lanes of its own, in which constants and
+    structural zeros are folded before XLA sees them: four to eight times as fast as `jax.vmap` of
+    `diffeqsolve` for double pendulums, twice as fast for a rigid body.
+
+    **Arguments:** as [`diffeqsolve`][], and
+
+    - `y0s`: initial values, any pytree; the leading axis of each leaf is that of the `N`
+        trajectories.
+    - `t0`, `t1`: common to all, or of shape `(N,)`.
+    - `args`, `in_axes`: what of `args` each trajectory has of its own, as in `jax.vmap`: 0 for a
+        leading axis, `None` for what is common to all; a prefix of the tree of `args`.
+    - `saveat`: the end, `SaveAt(t1=True)`, the start, times (common to all), and functions of them.
+    - `lanes`: how many trajectories advance together, on each device.
+    - `adjoint`: the mode of differentiation: reverse, or `diffrax.ForwardMode()` for `jax.jvp` and
+        `jax.jacfwd`. Both make the steps again that the solve made.
+    - `mesh`: a `jax.sharding.Mesh`, e.g. `jax.make_mesh((jax.device_count(),), ("trajectories",))`: each of
+        its devices, over all of its axes, solves an equal share of the trajectories in lanes of its
+        own. What is returned is sharded along the trajectories if their number divides among the devices, and
+        whole on each of them if not. Nothing is sent between devices until they are done, and for gradients
+        with respect to what is common to all one sum. Of several processes (`jax.distributed`) each passes the
+        same arguments. For explicit solvers. By default one device solves all.
+    - `throw`: raise a `RuntimeError` if any trajectory fails. By default it has a result code, and
+        the others are what they are without it.
+
+    Explicit Runge-Kutta methods, in a hook or alone, and [`Rodas5P`][] and [`Rodas3P`][] alone for up
+    to eight unknowns, with constant steps or `diffrax.PIDController`, are advanced so. Other solvers,
+    mass matrices, other controllers and systems too large to be written out number by number are
+    solved by `diffeqsolve` under `jax.lax.map` in batches of `lanes`. `execution` of the solution says
+    which way was taken, and why.
+
+    **Returns:**
+
+    An [`EnsembleSolution`][]. Reverse mode differentiates with respect to all arrays among the
+    arguments (not those that functions close over: pass them in `args`).
+
+    **Raises:**
+
+    As `diffeqsolve`, `ValueError` for leading axes that disagree, and for a `mesh` without devices or
+    with an implicit solver, and `TypeError` for a `mesh` that is none.
+    """
+    if mesh is not None:
+        check_mesh(mesh, solver)
+    check_arguments(terms, solver, dt0, saveat, stepsize_controller, adjoint, None, consistent)
+    batch = checked_batch(t0, t1, dt0, y0s, args, in_axes, saveat, lanes)
+    if not isinstance(max_steps, int) or max_steps < 1:
+        raise ValueError(f"`max_steps` must be a positive integer, got {max_steps!r}.")
+    one = jax.eval_shape(batch.one)
+    warn_of_rounding(one.y0, batch.dtype, stepsize_controller)
+    solver = without_idle_hook(solver, one.t0, one.y0, one.args)
+    equations = Equations(
+        terms, solver, stepsize_controller, saveat, dt0, adjoint, max_steps, consistent
+    )
+
+    def solve(inputs: Inputs, axes: Axes = ()) -> EnsembleSolution:
+        equations, batch = inputs
+        saveat = checked_times(equations.saveat, batch, axes)
+        dt0 = checked_step(equations.dt0, batch, axes)
+        inputs = dataclasses.replace(equations, saveat=saveat, dt0=dt0), batch
+        try:
+            solution = solve_on_one_device(inputs, lanes)
+        except Exception as error:
+            if fault := fault_of_field(equations.terms, one.t0, one.y0, one.args):
+                raise ValueError(fault) from error
+            error.add_note(_example(inputs[1]))
+            raise
+        solution = dataclasses.replace(solution, messages=messages_of(solver))
+        return _raise_if_any_failed(solution, axes) if throw else solution
+
+    inputs = equations, batch
+    return solve(inputs) if mesh is None else over_devices(solve, inputs, mesh)
+
+
+def _example(batch: Batch) -> str:
+    """For errors in what the user wrote."""
+    one = jax.eval_shape(batch.one)
+    return (
+        f"Of the {batch.size} trajectories of `y0s` each has a state of shapes {jtu.tree_map(jnp.shape, one.y0)}: the "
+        "leading axes are the trajectories. One alone is solved by `mj.diffeqsolve`."
+    )
+
+
+def _raise_if_any_failed(solution: EnsembleSolution, axes: Axes) -> EnsembleSolution:
+    number, failed = largest(solution.reasons(), axes), anywhere(solution.failed, axes)
+    return eqx.branched_error_if(solution, failed, number, solution.messages)

@@ -1,0 +1,1 @@
+"""Many trajectories at once: in the lanes of one loop, or mapped."""

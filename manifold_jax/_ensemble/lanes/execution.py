@@ -1,0 +1,63 @@
+"""How an ensemble is solved: in lanes where that is possible, else mapped over."""
+
+import dataclasses
+
+import diffrax as dfx
+import jax.numpy as jnp
+import jax.tree_util as jtu
+
+from ..._adjoint import StepReplayAdjoint
+from ..._jaxpr.lane_arrays import NotScalarError
+from ..._rosenbrock import AbstractRosenbrock
+from ..._solver.base import AbstractManifoldSolver
+from ..._solver.step.explicit import is_unrollable
+from ..._solver.terms import DirectedTerm
+from .in_lanes import solve_in_lanes, solve_in_lanes_forwards
+from .mapped import solve_mapped
+from .parts import Inputs
+from .solution import EnsembleSolution
+from .unconstrained import LARGEST_STIFF, Unconstrained
+
+
+def solve_on_one_device(inputs: Inputs, lanes: int) -> EnsembleSolution:
+    inputs = _with_hook(inputs)
+    obstacle = _obstacle(inputs)
+    if obstacle is None:
+        forwards = isinstance(inputs[0].adjoint, dfx.ForwardMode)
+        solve = solve_in_lanes_forwards if forwards else solve_in_lanes
+        try:
+            return solve(inputs, lanes)
+        except NotScalarError as error:
+            obstacle = str(error)
+    execution = f"mapped over, not in lanes: {obstacle}"
+    return dataclasses.replace(solve_mapped(inputs, lanes), execution=execution)
+
+
+def _with_hook(inputs: Inputs) -> Inputs:
+    """Lanes advance solvers of this library, of which one leaves states as they are."""
+    equations, batch = inputs
+    if isinstance(equations.solver, AbstractManifoldSolver):
+        return inputs
+    return dataclasses.replace(equations, solver=Unconstrained(equations.solver)), batch
+
+
+def _obstacle(inputs: Inputs) -> str | None:
+    """What keeps trajectories out of lanes."""
+    equations, batch = inputs
+    one, saveat, solver = batch.one(), equations.saveat, equations.solver
+    if not isinstance(equations.terms, dfx.ODETerm | DirectedTerm):
+        return f"`terms` are {type(equations.terms).__name__}, not an ODETerm"
+    if isinstance(solver, Unconstrained) and isinstance(solver.inner, AbstractRosenbrock):
+        size = sum(jnp.size(leaf) for leaf in jtu.tree_leaves(one.y0))
+        if size > LARGEST_STIFF:
+            return f"more than {LARGEST_STIFF} unknowns of a stiff system"
+    elif not is_unrollable(solver.inner, equations.terms, one.t0, one.t1, one.y0, one.args):
+        return f"{type(solver.inner).__name__} is not an explicit Runge-Kutta method"
+    if type(equations.controller) not in (dfx.PIDController, dfx.ConstantStepSize):
+        return f"`stepsize_controller` is {type(equations.controller).__name__}"
+    if not isinstance(equations.adjoint, StepReplayAdjoint | dfx.ForwardMode):
+        return f"`adjoint` is {type(equations.adjoint).__name__}"
+    others = saveat.solver_state or saveat.controller_state or saveat.made_jump
+    if not isinstance(saveat.subs, dfx.SubSaveAt) or others:
+        return "`saveat` asks for more than states"
+    return "`saveat` asks for steps" if saveat.dense or saveat.subs.steps else None

@@ -1,0 +1,143 @@
+"""Many trajectories in lanes, with their derivatives."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from diffrax import RESULTS
+
+from ..._base.compat import nonlinear_failure, update_result
+from ..._base.types import BoolScalar
+from ..._jaxpr.lane_arrays import NotScalarError
+from ..._solve.outcome import result_of_saved
+from .forward import tangents_in_lanes
+from .mapped import gradient_of_mapped, tangents_of_mapped
+from .parts import in_steps, Inputs, Parts, times_are_differentiated
+from .reverse import Ends, WayBack
+from .rows import saved_rows
+from .schedule import Run, Schedule
+from .solution import EnsembleSolution
+from .unconstrained import Unconstrained
+
+
+# Numbers that all trajectories have in common, each of which has a sum of its own in every lane.
+_MOST_IN_COMMON = 200
+
+
+def gradient_in_lanes(
+    inputs: Inputs, differentiated: Any, run: Run, bar: Any, lanes: int, limit: int
+) -> Any:
+    """`bar`: cotangents of times and values; `differentiated`: a tree of truth values."""
+    parts = Parts.of(inputs, differentiated)
+    if parts.num_common() > _MOST_IN_COMMON:
+        raise NotScalarError("too many numbers in common")
+
+    smooth_values, others = eqx.partition(run.values, eqx.is_inexact_array)
+
+    def saved(each: Any, common: Any, first: Any, last: Any, smooth_values: Any) -> Any:
+        equations, batch = parts.inputs(each, common)
+        values = eqx.combine(smooth_values, others)
+        start = run.start._replace(trajectory=run.start.trajectory._replace(y=first))
+        outcome = run.outcome._replace(y=last)
+        new = run._replace(start=start, outcome=outcome, values=values)
+        return eqx.filter(saved_rows(equations.saveat.subs, batch, new), eqx.is_inexact_array)
+
+    handed_out = run.start.trajectory.y, run.outcome.y, smooth_values
+    rows, pullback = jax.vjp(saved, parts.each, parts.common, *handed_out)
+    bar = jtu.tree_map(lambda x, b: jnp.zeros_like(x) if b is None else b, rows, bar)
+    each, common, *bars = pullback(bar)
+    ends = Ends(run.start.trajectory, run.outcome.num_steps, run.rows, run.states, *bars)
+    more = WayBack(parts, ends, lanes, limit).run()
+    each, common = jtu.tree_map(jnp.add, (each, common), more)
+    return parts.together(each, common)
+
+
+# Operations on one number, of a start and a step, beyond which trajectories are mapped over instead. A
+# double pendulum has 3389; the 16308 of a four-bar linkage take 72 s to compile, and half of the time.
+_LONGEST = 8_000
+# Of the way back, which has the step twice.
+_LONGEST_BACK = 5 * _LONGEST
+
+
+@eqx.filter_custom_vjp
+def solve_in_lanes(inputs: Inputs, lanes: int) -> EnsembleSolution:
+    solution, _ = _run(inputs, lanes)
+    return solution
+
+
+def _run(inputs: Inputs, lanes: int) -> tuple[EnsembleSolution, Run]:
+    equations, batch = inputs
+    equations = in_steps(equations)
+    run = Schedule(equations, batch.each, batch.complete, lanes, _LONGEST).run()
+    outcome, statistics = run.outcome, run.outcome.statistics
+    stats = {
+        "num_steps": outcome.num_steps,
+        "num_accepted_steps": outcome.num_accepted,
+        "num_rejected_steps": outcome.num_steps - outcome.num_accepted,
+    }
+    if not isinstance(equations.solver, Unconstrained):
+        stats |= {
+            "initial_correction": run.start.correction,
+            "num_projection_iterations": statistics.iterations,
+            "largest_correction": statistics.largest_correction,
+            "correction_share": jax.vmap(lambda s: s.correction_share)(statistics),
+        }
+    ts, ys = saved_rows(equations.saveat.subs, batch, run)
+    result = jax.vmap(_unless_failed)(outcome.result, run.failed)
+    if not equations.solver.corrects_output:
+        finite = jax.vmap(lambda ts, ys: result_of_saved(equations.saveat, ts, ys))(ts, ys)
+        result = jax.vmap(update_result)(result, finite)
+    return EnsembleSolution(ts, ys, stats, result), run
+
+
+def _unless_failed(result: RESULTS, failed: BoolScalar) -> RESULTS:
+    """`failed`: whether a value could not be corrected."""
+    failure = RESULTS.where(failed, nonlinear_failure(), RESULTS.successful)
+    return update_result(result, failure)
+
+
+@solve_in_lanes.def_fwd
+def _forward(perturbed, inputs, lanes):
+    del perturbed
+    return _run(inputs, lanes)
+
+
+@solve_in_lanes.def_bwd
+def _backward(run, cotangents, perturbed, inputs, lanes):
+    bar = cotangents.ts, cotangents.ys
+    if not times_are_differentiated(perturbed):
+        try:
+            return gradient_in_lanes(inputs, perturbed, run, bar, lanes, _LONGEST_BACK)
+        except NotScalarError:
+            pass
+    return gradient_of_mapped(inputs, perturbed, bar, lanes)
+
+
+@eqx.filter_custom_jvp
+def solve_in_lanes_forwards(inputs: Inputs, lanes: int) -> EnsembleSolution:
+    """With forward mode instead."""
+    solution, _ = _run(inputs, lanes)
+    return solution
+
+
+@solve_in_lanes_forwards.def_jvp
+def _tangents(primals, tangents):
+    (inputs, lanes), (tangents, _) = primals, tangents
+    solution, _ = _run(inputs, lanes)
+    differentiated = jtu.tree_map(lambda x: x is not None, tangents, is_leaf=lambda x: x is None)
+    along = None
+    if not times_are_differentiated(differentiated):
+        try:
+            along = tangents_in_lanes(inputs, tangents, lanes, _LONGEST_BACK)
+        except NotScalarError:
+            pass
+    if along is None:
+        along = tangents_of_mapped(inputs, tangents, lanes)
+    ts, ys = along
+    return solution, EnsembleSolution(ts, ys, *_none((solution.stats, solution.result)))
+
+
+def _none(tree: Any) -> Any:
+    return jtu.tree_map(lambda _: None, tree)

@@ -1,0 +1,73 @@
+"""What an ensemble returns."""
+
+from typing import Any
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from diffrax import RESULTS
+from jaxtyping import Array, PyTree
+
+from ..._base.compat import is_okay, number_of_result
+from ..._solve.outcome import (
+    is_unusable_start,
+    is_without_time,
+    messages_for,
+    NO_TIME,
+    NOT_FINITE_START,
+    UNUSABLE_START,
+)
+
+
+class EnsembleSolution(eqx.Module):
+    """Of `N` trajectories, in the order of the initial values.
+
+    - `ts`: the times of what was saved, `(N, T)`; infinite where a trajectory did not get there, and with
+      `SaveAt(t1=True)` the time at which it stopped: see `failed`.
+    - `ys`: the saved values, `(N, T, ...)`.
+    - `stats`: as of [`diffeqsolve`][] without `max_steps`, each of shape `(N,)`.
+    - `result`: the result codes of all trajectories.
+    - `execution`: "in lanes", or why not.
+    - `messages`: what the result codes mean, by number; the last three say of a trajectory without
+        steps that its times or its start could not be used.
+    """
+
+    ts: PyTree[Array]
+    ys: PyTree[Array]
+    stats: dict[str, Any]
+    result: RESULTS
+    execution: str = eqx.field(static=True, default="in lanes")
+    messages: tuple[str, ...] = eqx.field(static=True, default=(), repr=False)
+
+    @property
+    def failed(self) -> Array:
+        """Which trajectories did not get to their end, shape `(N,)`."""
+        return ~jax.vmap(is_okay)(self.result)
+
+    def reasons(self) -> Array:
+        """Numbers of `messages`, shape `(N,)`, 0 where a trajectory is successful."""
+        codes = number_of_result(self.result)
+        num_steps, last = self.stats["num_steps"], len(self.messages) - 1
+        # A start that is not finite cannot be moved by a finite distance.
+        moved = self.stats.get("initial_correction", jnp.zeros_like(num_steps, float))
+        start = jnp.where(jnp.isnan(moved), last - 1, last)
+        codes = jnp.where(is_without_time(codes, num_steps), last - 2, codes)
+        codes = jnp.where(is_unusable_start(codes, num_steps), start, codes)
+        return jnp.where(self.failed, codes, 0)
+
+    def failures(self, most: int = 10) -> list[tuple[int, str]]:
+        """Numbers and reasons of the first that failed; not under `jit`. Of several processes each
+        lists those of its own devices."""
+        reasons, failed = jnp.asarray(self.reasons()), {}
+        for shard in reasons.addressable_shards:
+            part = np.asarray(shard.data)
+            first = shard.index[0].start or 0
+            failed |= {first + int(i): self.messages[part[i]] for i in np.flatnonzero(part)}
+        return sorted(failed.items())[:most]
+
+
+def messages_of(solver: dfx.AbstractSolver) -> tuple[str, ...]:
+    """What `EnsembleSolution.reasons` are numbers of."""
+    return (*messages_for(solver), NO_TIME, NOT_FINITE_START, UNUSABLE_START)

@@ -1,0 +1,219 @@
+"""One trajectory as functions of arrays: how it begins, one attempted step, a value inside it.
+
+What `diffrax.diffeqsolve` does in its loop, through the public methods of solvers and controllers, so
+that many of them can be advanced by a loop of another kind.
+"""
+
+from typing import Any, NamedTuple
+
+import diffrax as dfx
+import equinox as eqx
+import jax.numpy as jnp
+import jax.tree_util as jtu
+from diffrax import RESULTS
+
+from ..._base.compat import directed, is_okay, nonlinear_failure, update_result
+from ..._base.rejection import result_of_state
+from ..._base.types import Args, BoolScalar, FloatScalar, IntScalar, RealScalarLike, Y
+from ..._solve.prepare import prepare, Ready
+from ..._solve.start import Consistent
+from ..._solve.times import is_time_missing
+from ..._solver.step.advance import HookState, StepStatistics
+from .unconstrained import Unconstrained
+
+
+class Trajectory(NamedTuple):
+    """Between two steps, with times that increase."""
+
+    tprev: FloatScalar
+    tnext: FloatScalar
+    y: Y
+    solver_state: HookState
+    controller_state: Any
+    result: RESULTS
+    num_steps: IntScalar
+    num_accepted: IntScalar
+
+
+class Given(NamedTuple):
+    """What a trajectory is defined by, besides what all have in common."""
+
+    t0: FloatScalar
+    t1: FloatScalar
+    y0: Y
+    args: Args
+
+    @property
+    def direction(self) -> FloatScalar:
+        return jnp.where(self.t0 < self.t1, 1, -1).astype(self.t0.dtype)
+
+
+class Start(NamedTuple):
+    trajectory: Trajectory
+    correction: FloatScalar
+
+
+class Attempt(NamedTuple):
+    """What a step led to; whether it was kept, where it ended if so, and its interpolation."""
+
+    trajectory: Trajectory
+    kept: BoolScalar
+    start: FloatScalar
+    end: FloatScalar
+    dense_info: Any
+
+
+class Outcome(NamedTuple):
+    """Of a trajectory that has ended."""
+
+    t: FloatScalar
+    y: Y
+    result: RESULTS
+    num_steps: IntScalar
+    num_accepted: IntScalar
+    statistics: StepStatistics
+
+
+class Equations(eqx.Module):
+    """What all trajectories have in common."""
+
+    terms: dfx.AbstractTerm
+    solver: Any  # for lanes one of this library, else any of Diffrax
+    controller: dfx.AbstractStepSizeController
+    saveat: dfx.SaveAt
+    dt0: RealScalarLike | None
+    adjoint: dfx.AbstractAdjoint
+    max_steps: int = eqx.field(static=True)
+    consistent: Consistent = eqx.field(static=True)
+
+    def begin(self, given: Given) -> Start:
+        solver, args, ready = self.solver, given.args, self._ready(given)
+        terms, direction = self._directed(given)
+        t0, t1 = ready.t0 * direction, ready.t1 * direction
+        dt0 = None if ready.dt0 is None else ready.dt0 * direction
+        error_order = solver.error_order(terms)
+        tnext, controller_state = self.controller.wrap(direction).init(
+            terms, t0, t1, ready.y0, dt0, args, solver.func, error_order
+        )
+        tnext = jnp.minimum(tnext, t1)
+        solver_state = ready.solver_state
+        if solver_state is None:
+            solver_state = solver.init(terms, t0, tnext, ready.y0, args)
+        result = RESULTS.where(ready.start.success, RESULTS.successful, nonlinear_failure())
+        result = update_result(result, result_of_state(ready.y0))
+        missing = is_time_missing(given.t0, given.t1)
+        result = RESULTS.where(missing, RESULTS.nonfinite_input, result)  # pyright: ignore[reportArgumentType]
+        zero = jnp.zeros((), jnp.int32)
+        trajectory = Trajectory(
+            t0, tnext, ready.y0, solver_state, controller_state, result, zero, zero
+        )
+        return Start(trajectory, ready.start.correction)
+
+    def _ready(self, given: Given) -> Ready:
+        solver, (t0, t1, y0, args) = self.solver, given
+        if isinstance(solver, Unconstrained):
+            return solver.ready(
+                self.terms, t0, t1, self.dt0, y0, args, self.saveat, self.controller
+            )
+        return prepare(
+            self.terms,
+            solver,
+            t0,
+            t1,
+            self.dt0,
+            y0,
+            args,
+            self.saveat,
+            self.controller,
+            self.consistent,
+            throw=False,
+        )
+
+    def goes_on(self, given: Given, trajectory: Trajectory) -> BoolScalar:
+        before = trajectory.tprev < given.t1 * given.direction
+        return before & self._successful(trajectory) & (trajectory.num_steps < self.max_steps)
+
+    def attempt(self, given: Given, trajectory: Trajectory) -> Attempt:
+        terms, direction = self._directed(given)
+        t1, solver = given.t1 * direction, self.solver
+        before, end = trajectory, trajectory.tnext
+        y, error, dense_info, solver_state, solver_result = solver.step(
+            terms, before.tprev, end, before.y, given.args, before.solver_state, False
+        )
+        error = jtu.tree_map(lambda x: jnp.where(jnp.isnan(x), jnp.inf, x), error)
+        kept, tprev, tnext, _, controller_state, result = self.controller.wrap(
+            direction
+        ).adapt_step_size(
+            before.tprev,
+            end,
+            before.y,
+            y,
+            given.args,
+            error,
+            solver.error_order(terms),
+            before.controller_state,
+        )
+        kept = jnp.asarray(kept)
+        tprev = jnp.minimum(tprev, t1)
+        tnext = _clipped(tprev, tnext, t1, kept)  # pyright: ignore[reportArgumentType]
+        keep = lambda a, b: jnp.where(kept, a, b)
+        result = update_result(RESULTS.where(kept, solver_result, RESULTS.successful), result)
+        after = Trajectory(
+            tprev,
+            tnext,
+            jtu.tree_map(keep, y, before.y),
+            jtu.tree_map(keep, solver_state, before.solver_state),
+            controller_state,
+            update_result(before.result, result),
+            before.num_steps + 1,
+            before.num_accepted + jnp.where(kept, 1, 0),
+        )
+        return Attempt(after, kept, before.tprev, end, dense_info)
+
+    def state_of(self, trajectory: Trajectory) -> Y:
+        return trajectory.y
+
+    def interpolated(
+        self, t: FloatScalar, start: FloatScalar, end: FloatScalar, dense_info: Any
+    ) -> Y:
+        """The state inside a step, as the solver interpolates it. Times increase."""
+        return self.solver.interpolation_cls(t0=start, t1=end, **dense_info).evaluate(t)
+
+    def handed_out(self, given: Given, t: FloatScalar, y: Y) -> tuple[Any, BoolScalar]:
+        """What is saved of such a state, and whether it is on the manifold. `t` is the true time."""
+        success = jnp.asarray(True)
+        if self.solver.corrects_output:
+            y, info = self.solver.correct(t, y, given.args)
+            success = info.success
+            y = jtu.tree_map(lambda leaf: jnp.where(success, leaf, jnp.nan), y)
+        return self.saveat.subs.fn(t, y, given.args), success
+
+    def outcome(self, given: Given, trajectory: Trajectory) -> Outcome:
+        result = trajectory.result
+        unfinished = (trajectory.tprev < given.t1 * given.direction) & self._successful(trajectory)
+        result = RESULTS.where(unfinished, RESULTS.max_steps_reached, result)
+        result = update_result(result, trajectory.solver_state.result)
+        t = trajectory.tprev * given.direction
+        return Outcome(
+            t,
+            trajectory.y,
+            result,
+            trajectory.num_steps,
+            trajectory.num_accepted,
+            trajectory.solver_state.statistics,
+        )
+
+    def _successful(self, trajectory: Trajectory) -> BoolScalar:
+        return is_okay(trajectory.result)
+
+    def _directed(self, given: Given) -> tuple[Any, FloatScalar]:
+        return directed(self.terms, given.direction), given.direction
+
+
+def _clipped(
+    tprev: FloatScalar, tnext: FloatScalar, t1: FloatScalar, kept: BoolScalar
+) -> FloatScalar:
+    """Not just short of the end, where a step of a few rounding errors would be left."""
+    floor = t1 - 50 * jnp.finfo(t1.dtype).eps * jnp.abs(t1)
+    end = jnp.where(kept, t1, tprev + 0.5 * (t1 - tprev))
+    return jnp.where(tnext > floor, end, tnext)

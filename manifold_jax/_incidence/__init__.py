@@ -1,1 +1,0 @@
-from .walk import Incidence as Incidence, incidence as incidence

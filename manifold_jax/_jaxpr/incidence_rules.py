@@ -1,0 +1,218 @@
+"""What the results of one primitive depend on, number by number."""
+
+import functools
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from .incidence_moves import bind, landing, move, MOVES, num_moved
+
+
+class Value(NamedTuple):
+    """Of an array of shape `S`: the inputs its numbers depend on, shape `(*S, inputs + 1)`, and the
+    numbers themselves if they are constants. Behind the inputs stands whether a number may be
+    other than zero: for sums and moves that follows the same rule."""
+
+    depends: np.ndarray
+    known: np.ndarray | None = None
+
+    @staticmethod
+    def constant(known: np.ndarray, inputs: int) -> "Value":
+        depends = np.zeros((*known.shape, inputs + 1), bool)
+        depends[..., -1] = known != 0
+        return Value(depends, known)
+
+    @property
+    def is_constant(self) -> bool:
+        return not self.depends[..., :-1].any()
+
+
+# Larger constants are not folded: their zeros are not worth the time.
+_MOST_FOLDED = 1_000_000
+
+_FOLDED_WITH_NUMPY = {
+    "add": np.add,
+    "and": np.bitwise_and,
+    "eq": np.equal,
+    "ge": np.greater_equal,
+    "gt": np.greater,
+    "le": np.less_equal,
+    "lt": np.less,
+    "mul": np.multiply,
+    "ne": np.not_equal,
+    "neg": np.negative,
+    "sub": np.subtract,
+}
+
+
+def known_value(equation: Any, values: list[Value]) -> list[np.ndarray] | None:
+    """What an equation makes of constants, if it is known."""
+    operands = [value.known for value in values if value.known is not None]
+    if len(operands) < len(values):
+        return None
+    if sum(int(np.prod(out.aval.shape)) for out in equation.outvars) > _MOST_FOLDED:
+        return None
+    name = equation.primitive.name
+    try:
+        if name in _FOLDED_WITH_NUMPY:
+            return [np.asarray(_FOLDED_WITH_NUMPY[name](*operands))]
+        if name in MOVES and name != "gather":
+            return move(equation, operands)
+        return bind(equation, operands, equation.params)
+    except Exception:  # a constant that cannot be evaluated is not known, no more
+        return None
+
+
+def union(values: list[Value]) -> np.ndarray:
+    """All inputs that any of the numbers depends on."""
+    flat = [value.depends.reshape(-1, value.depends.shape[-1]).any(axis=0) for value in values]
+    return functools.reduce(np.logical_or, flat)  # pyright: ignore[reportReturnType]
+
+
+def _spread(depends: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    return np.broadcast_to(depends, (*shape, depends.shape[-1]))
+
+
+def _vanishing(equation: Any, values: list[Value]) -> list[Value]:
+    """Number by number, and zero of zeros."""
+    shape = equation.outvars[0].aval.shape
+    return [
+        Value(functools.reduce(np.logical_or, [_spread(value.depends, shape) for value in values]))
+    ]
+
+
+def _elementwise(equation: Any, values: list[Value]) -> list[Value]:
+    depends = _vanishing(equation, values)[0].depends.copy()
+    depends[..., -1] = True
+    return [Value(depends)]
+
+
+def _multiply(equation: Any, values: list[Value]) -> list[Value]:
+    """Nothing depends on what is multiplied by zero."""
+    a, b = (_spread(value.depends, equation.outvars[0].aval.shape) for value in values)
+    return [Value((a | b) & a[..., -1:] & b[..., -1:])]
+
+
+def _divide(equation: Any, values: list[Value]) -> list[Value]:
+    a, b = (_spread(value.depends, equation.outvars[0].aval.shape) for value in values)
+    return [Value((a | b) & a[..., -1:])]
+
+
+def _power(equation: Any, values: list[Value]) -> list[Value]:
+    keeps_zero = equation.params["y"] > 0
+    return _vanishing(equation, values) if keeps_zero else _elementwise(equation, values)
+
+
+def _select(equation: Any, values: list[Value]) -> list[Value]:
+    shape = equation.outvars[0].aval.shape
+    which, *cases = values
+    alternatives = [_spread(case.depends, shape) for case in cases]
+    if which.known is not None:
+        chosen = np.broadcast_to(which.known, shape).astype(int)[..., None]
+        return [Value(np.choose(chosen, alternatives))]
+    depends = functools.reduce(np.logical_or, alternatives)
+    return [
+        Value(
+            depends
+            | _spread(which.depends, shape) & (np.arange(depends.shape[-1]) + 1 < depends.shape[-1])
+        )
+    ]
+
+
+def _moved(equation: Any, values: list[Value]) -> list[Value] | None:
+    """The primitive is asked where each number goes, with their indices for numbers."""
+    number = num_moved(equation.primitive.name, len(values))
+    operands = [value.known for value in values]
+    if any(operand is None for operand in operands[number:]):
+        return None
+    start, rows = 0, []
+    for i, value in enumerate(values[:number]):
+        shape = value.depends.shape[:-1]
+        size = int(np.prod(shape))
+        operands[i] = np.arange(start, start + size, dtype=np.int32).reshape(shape)
+        rows.append(value.depends.reshape(size, value.depends.shape[-1]))
+        start += size
+    nowhere = np.arange(rows[0].shape[1]) == rows[0].shape[1] - 1  # some constant
+    table = np.concatenate([*rows, nowhere[None]])
+    return [Value(table[places]) for places in move(equation, operands)]  # pyright: ignore[reportArgumentType]
+
+
+def _reduced(equation: Any, values: list[Value]) -> list[Value]:
+    axes = tuple(equation.params["axes"])
+    return [Value(value.depends.any(axis=axes)) for value in values]  # pyright: ignore[reportArgumentType]
+
+
+def _cumulated(equation: Any, values: list[Value]) -> list[Value]:
+    axis, depends = equation.params["axis"], values[0].depends
+    turn = (lambda x: np.flip(x, axis)) if equation.params.get("reverse") else (lambda x: x)
+    return [Value(turn(np.logical_or.accumulate(turn(depends), axis=axis)))]
+
+
+def _contracted(equation: Any, values: list[Value]) -> list[Value]:
+    """A product of arrays, in which some numbers may be zero."""
+    (left, right), (left_batch, right_batch) = equation.params["dimension_numbers"]
+    letters: list[list[int | None]] = [[None] * (value.depends.ndim - 1) for value in values]
+    axes = iter(range(100))
+    for pairs in (zip(left_batch, right_batch, strict=True), zip(left, right, strict=True)):
+        for i, j in pairs:
+            letters[0][i] = letters[1][j] = next(axes)
+    batch = [letters[0][i] for i in left_batch]
+    free = []
+    for names in letters:
+        for i, name in enumerate(names):
+            if name is None:
+                names[i] = next(axes)
+                free.append(names[i])
+    inputs = next(axes)
+    depends = False
+    for k, value in enumerate(values):
+        there = values[1 - k].depends[..., -1].astype(np.float32)
+        own = value.depends.astype(np.float32), [*letters[k], inputs]
+        depends |= np.einsum(*own, there, letters[1 - k], [*batch, *free, inputs]) > 0  # pyright: ignore[reportArgumentType, reportCallIssue]
+    return [Value(np.asarray(depends))]
+
+
+def _scattered(equation: Any, values: list[Value]) -> list[Value] | None:
+    operand, indices, update = values
+    if indices.known is None:
+        return None
+    shape, number = operand.depends.shape[:-1], operand.depends.shape[-1]
+    places = landing(equation, shape, indices.known, update.depends.shape[:-1]).ravel()
+    lands = places >= 0
+    result = operand.depends.reshape(-1, number).copy()
+    if equation.primitive.name == "scatter":  # what was there is replaced
+        result[places[lands]] = False
+    np.logical_or.at(result, places[lands], update.depends.reshape(-1, number)[lands])
+    return [Value(result.reshape(*shape, number))]
+
+
+_VANISHING = """
+    abs add add_any asin asinh atan atanh cbrt ceil convert_element_type copy erf expm1 floor imag
+    log1p max min neg real reduce_precision round sign sin sinh sqrt square stop_gradient sub tan tanh
+"""
+_ELEMENTWISE = """
+    acos acosh and atan2 bessel_i0e bessel_i1e clamp complex conj cos cosh digamma eq erf_inv erfc exp
+    exp2 ge gt igamma igamma_grad_a igammac is_finite le lgamma log logistic lt ne nextafter not or
+    polygamma pow regularized_incomplete_beta rem rsqrt xor zeta
+"""
+_REDUCTIONS = "reduce_and reduce_max reduce_min reduce_or reduce_prod reduce_sum reduce_xor"
+_CUMULATIONS = "cumlogsumexp cummax cummin cumprod cumsum"
+_SCATTERS = """
+    scatter scatter-add scatter-max scatter-min scatter-mul scatter-sub scatter_add scatter_max
+    scatter_min scatter_mul scatter_sub
+"""
+
+RULES: dict[str, Callable[[Any, list[Value]], list[Value] | None]] = {
+    **dict.fromkeys(_VANISHING.split(), _vanishing),
+    **dict.fromkeys(_ELEMENTWISE.split(), _elementwise),
+    **dict.fromkeys(MOVES, _moved),
+    **dict.fromkeys(_REDUCTIONS.split(), _reduced),
+    **dict.fromkeys(_CUMULATIONS.split(), _cumulated),
+    **dict.fromkeys(_SCATTERS.split(), _scattered),
+    "div": _divide,
+    "dot_general": _contracted,
+    "integer_pow": _power,
+    "mul": _multiply,
+    "select_n": _select,
+}

@@ -1,0 +1,122 @@
+"""What is known while a function is interpreted: how many lanes, what has been computed already."""
+
+import contextlib
+from collections.abc import Iterator
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from .lane_value import Node, Number
+
+
+class NotScalarError(Exception):
+    """The function cannot be treated, or would become too long."""
+
+
+# XLA for CPUs copies a result into every kernel that needs it, with all that leads to it, unless it is
+# one of these.
+_COMPUTED_ONCE = frozenset(
+    "acos acosh asin asinh atan atan2 atanh cbrt cosh div erf exp exp2 expm1 log log1p logistic pow rem "
+    "rsqrt sinh sqrt tan tanh".split()
+)
+# Those take as long as many other operations, but are not among them.
+_LONG = {"sin": 50, "cos": 50}
+# Operations that may be copied. A division, which is what it takes to have a result computed once,
+# takes as long. (Measured: 16 is 5 % faster than 8, and compiles in 0.9 of the time.)
+_DIVISION = 16
+
+
+class Lanes:
+    """`count` trajectories. `limit` is the largest number of operations; `whole` collects the names
+    of operations that were done on whole arrays, as there is no rule for them."""
+
+    def __init__(self, count: int, limit: int):
+        self.count, self.limit = count, limit
+        self.operations = 0
+        self.whole: set[str] = set()
+        self._known: list[dict[Any, Node]] = [{}]
+        self._one: jax.Array | None = None
+
+    @contextlib.contextmanager
+    def inside(self, finite: jax.Array | None = None) -> Iterator[None]:
+        """The body of a loop: what is computed in it is not known outside. `finite` are numbers of
+        all lanes that are never infinite."""
+        before = self._one
+        if finite is not None:
+            # A one that XLA cannot tell from other numbers.
+            self._one = jnp.where(finite == finite, jnp.ones_like(finite), finite)
+        self._known.append({})
+        yield
+        self._known.pop()
+        self._one = before
+
+    def apply(self, primitive: Any, params: dict[str, Any], dtype: Any, *numbers: Number) -> Node:
+        """One operation on numbers, of which not all are constants; once, whoever asks for it."""
+        key = self._key(primitive, params, numbers)
+        if key is not None and key in self._known[-1]:
+            return self._known[-1][key]
+        self.count_operations(1)
+        node = Node(primitive, params, dtype, numbers)
+        if key is not None:
+            self._known[-1][key] = node  # which keeps its operands, and so their identities
+        return node
+
+    def count_operations(self, count: int) -> None:
+        self.operations += count
+        if self.operations > self.limit:
+            raise NotScalarError(f"more than {self.limit} operations")
+
+    def array(self, x: Number, dtype: Any) -> jax.Array:
+        """One for each lane."""
+        x = self.emitted(x)
+        if isinstance(x, np.generic):
+            return lax.full((self.count,), x, dtype)  # pyright: ignore[reportArgumentType]
+        return x if x.ndim == 1 else lax.broadcast(x, (self.count,))
+
+    def emitted(self, x: Number) -> Any:
+        """A number as XLA is given it."""
+        if not isinstance(x, Node):
+            return x
+        pending = [x]
+        while pending:
+            node = pending[-1]
+            if node.array is not None:
+                pending.pop()
+                continue
+            missing = [y for y in node.operands if isinstance(y, Node) and y.array is None]
+            if missing:
+                pending.extend(missing)
+            else:
+                self._emit(node)
+                pending.pop()
+        return x.array
+
+    def _emit(self, node: Node) -> None:
+        operands = [y.array if isinstance(y, Node) else y for y in node.operands]
+        if any(not isinstance(y, np.generic) and y.ndim == 1 for y in operands):  # pyright: ignore[reportOptionalMemberAccess]
+            arrays = [self.array(y, y.dtype) for y in operands]  # pyright: ignore[reportOptionalMemberAccess]
+        else:
+            arrays = [jnp.asarray(y) for y in operands]
+        array = node.primitive.bind(*arrays, **node.params)
+        operands = sum(y.copied for y in node.operands if isinstance(y, Node))
+        node.copied = _LONG.get(node.primitive.name, 1) + operands
+        if node.primitive.name in _COMPUTED_ONCE:
+            node.copied = 0
+        elif node.copied * (node.uses - 1) > _DIVISION and self._can_settle(array):
+            array, node.copied = array / self._one, 0
+        node.array = array
+
+    def _can_settle(self, array: jax.Array) -> bool:
+        return self._one is not None and array.ndim == 1 and array.dtype == self._one.dtype
+
+    def _key(self, primitive: Any, params: dict[str, Any], numbers: tuple[Number, ...]) -> Any:
+        same = [(x.dtype.str, x.tobytes()) if isinstance(x, np.generic) else id(x) for x in numbers]
+        key = primitive.name, tuple(params.items()), tuple(same)
+        try:
+            hash(key)
+        except TypeError:
+            return None
+        return key

@@ -1,0 +1,1 @@
+"""Dense, banded and sparse linear algebra, and the Newton iterations on it."""

@@ -1,0 +1,281 @@
+"""Small dense linear systems as arithmetic that XLA can fuse.
+
+A LAPACK or cuSOLVER call per step costs more than a whole Runge-Kutta step of a small
+mechanism and cannot be fused across a batch. Up to `UNROLL_LIMIT` rows the elimination
+is therefore written out entry by entry; beyond that the library routine is used.
+"""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.scipy.linalg as jsl
+import numpy as np
+from jaxtyping import Array, Float
+
+from .._base.derivative_rule import ForwardRule
+from .._base.types import BoolScalar, FloatScalar
+
+
+# Number of operations grows like m^3 / 3: 170 at m = 8, still less than one library call.
+UNROLL_LIMIT = 8
+
+# Columns up to which an elimination with row exchanges is written out.
+_UNROLLED_COLUMNS = 4
+
+
+class Factorization(eqx.Module):
+    """`A = L U` of a square matrix, with a flag that says whether its rank was full.
+
+    Without pivoting when unrolled: the matrices met here are `G V` with `V` close to
+    `W^-1 G^T`, or mass matrices, hence close to symmetric positive definite. Where the rank
+    is not full the solution is finite but meaningless: its derivative must not be NaN, as
+    the zero cotangent of a rejected step would turn into NaN, too.
+
+    The derivative is that of `A x = b`, not of the elimination: five times less to compile.
+    """
+
+    A: Float[Array, "m m"]
+    lu: list[list[Float[Array, ""]]] | tuple[Float[Array, "m m"], Array]  # held fixed
+    full_rank: BoolScalar
+
+    def solve(self, b: Float[Array, "m ..."]) -> Float[Array, "m ..."]:
+        A, lu = self.A, self.lu
+        return jax.lax.custom_linear_solve(
+            lambda x: _product(A, x),
+            b,
+            lambda _, b: _substitute(lu, b),
+            lambda _, b: _substitute_transposed(lu, b),
+        )
+
+
+def _substitute(lu: Any, b: Float[Array, "m ..."]) -> Float[Array, "m ..."]:
+    """`(L U)^-1 b`."""
+    if not isinstance(lu, list):
+        return jsl.lu_solve(lu, b)
+    m = len(lu)
+    x = [b[i] for i in range(m)]
+    for i in range(m):
+        for k in range(i):
+            x[i] = x[i] - lu[i][k] * x[k]
+    for i in reversed(range(m)):
+        for k in range(i + 1, m):
+            x[i] = x[i] - lu[i][k] * x[k]
+        x[i] = x[i] / lu[i][i]
+    return jnp.stack(x)
+
+
+def _substitute_transposed(lu: Any, b: Float[Array, "m ..."]) -> Float[Array, "m ..."]:
+    """`(U^T L^T)^-1 b`."""
+    if not isinstance(lu, list):
+        return jsl.lu_solve(lu, b, trans=1)
+    m = len(lu)
+    x = [b[i] for i in range(m)]
+    for i in range(m):
+        for k in range(i):
+            x[i] = x[i] - lu[k][i] * x[k]
+        x[i] = x[i] / lu[i][i]
+    for i in reversed(range(m)):
+        for k in range(i + 1, m):
+            x[i] = x[i] - lu[k][i] * x[k]
+    return jnp.stack(x)
+
+
+class Inverse(eqx.Module):
+    """`A^-1` by Gauss-Jordan elimination without pivoting, the whole matrix in one array: fewer and
+    larger operations than those of [`Factorization`][], of which a program is compiled in less
+    time. For what is evaluated once in a step; at stages the elimination is faster."""
+
+    inverse: Float[Array, "m m"]
+    full_rank: BoolScalar
+
+    def solve(self, b: Float[Array, "m ..."]) -> Float[Array, "m ..."]:
+        return _product(self.inverse, b)
+
+
+# Rows from which on the inverse pays.
+_SMALLEST_INVERSE = 3
+
+
+def factorize_once(A: Float[Array, "m m"]) -> "Factorization | Inverse":
+    """For what is evaluated once in a step, or in a solve."""
+    if not _SMALLEST_INVERSE <= A.shape[0] <= UNROLL_LIMIT:
+        return factorize(A)  # pyright: ignore[reportReturnType]
+    return Inverse(*_invert(A))
+
+
+@jax.custom_jvp
+def _invert(A: Float[Array, "m m"]) -> tuple[Float[Array, "m m"], BoolScalar]:
+    """And whether the rank was full, as in [`factorize`][]."""
+    m = A.shape[0]
+    rows, diagonal = jnp.arange(m), jnp.abs(jnp.diagonal(A))
+    full_rank = jnp.asarray(True)
+    for k in range(m):
+        accepted = A[k, k] > _threshold(A) * diagonal[k]
+        full_rank &= accepted
+        row = jnp.where(rows == k, 1, A[k]) / jnp.where(accepted, A[k, k], 1)
+        others = jnp.where((rows == k)[None, :], 0, A) - A[:, k][:, None] * row[None, :]
+        A = jnp.where((rows == k)[:, None], row[None, :], others)
+    return A, full_rank
+
+
+@_invert.defjvp  # pyright: ignore[reportArgumentType]
+def _invert_jvp(primals, tangents):
+    (A,), (A_dot,) = primals, tangents
+    X, full_rank = _invert(A)
+    no_tangent = np.zeros((), jax.dtypes.float0)
+    return (X, full_rank), (-_product(_product(X, A_dot), X), no_tangent)
+
+
+def _threshold(A: Float[Array, "m m"]) -> float:
+    return 10 * A.shape[0] * float(jnp.finfo(A.dtype).eps)
+
+
+def _product(A: Float[Array, "i j"], B: Float[Array, "j ..."]) -> Float[Array, "i ..."]:
+    """`A B`; small ones as a sum that fuses, as batched tiny `dot`s are slow."""
+    if A.shape[0] > UNROLL_LIMIT:
+        return jnp.tensordot(A, B, axes=1)
+    return jnp.sum(A.reshape(*A.shape, *(1,) * (B.ndim - 1)) * B[None], axis=1)
+
+
+class PseudoInverse(eqx.Module):
+    """`A^+`: for equations that depend on each other the solution of least norm, where the matrix is
+    equilibrated with each unknown multiplied by the square root of its diagonal entry.
+
+    Its derivative is that at constant rank (Golub & Pereyra 1973).
+    """
+
+    inverse: Float[Array, "m m"]
+    full_rank: BoolScalar  # not asked for: only whether the matrix was finite
+
+    def solve(self, b: Float[Array, "m ..."]) -> Float[Array, "m ..."]:
+        return self.inverse @ b
+
+
+def factorize(A: Float[Array, "m m"], redundant: bool = False) -> Factorization | PseudoInverse:
+    """Factor `A`, symmetric positive semidefinite if `redundant`.
+
+    The rank counts as full when every pivot exceeds `10 m eps` times its diagonal entry: for a Gram matrix `A = G W^-1 G^T` that ratio is the squared sine of the angle between
+    one row of `G` and the span of those before it, and rounding leaves about `eps` of it.
+    """
+    if redundant:
+        return pseudo_invert(A, equilibrated=True)
+    m, fixed = A.shape[0], jax.lax.stop_gradient(A)
+    if m > UNROLL_LIMIT:
+        return _factorize_with_library(A)
+    lu = [[fixed[i, j] for j in range(m)] for i in range(m)]
+    full_rank = jnp.asarray(True)
+    for k in range(m):
+        accepted = lu[k][k] > _threshold(A) * jnp.abs(fixed[k, k])
+        full_rank &= accepted
+        lu[k][k] = jnp.where(accepted, lu[k][k], 1)
+        for i in range(k + 1, m):
+            lu[i][k] = lu[i][k] / lu[k][k]
+            for j in range(k + 1, m):
+                lu[i][j] = lu[i][j] - lu[i][k] * lu[k][j]
+    return Factorization(A, lu, full_rank)
+
+
+# Equations that depend on each other on the manifold do so only nearly at a stage beside it:
+# eigenvalues of `A` below this fraction of the largest count as zero.
+_DEPENDENT = 1e-4
+
+
+def pseudo_invert(
+    A: Float[Array, "m m"], *, equilibrated: bool = False, dependent: Any = _DEPENDENT
+) -> PseudoInverse:
+    """Of a symmetric positive semidefinite matrix; `equilibrated` with its diagonal scaled to one,
+    so that the units of equations do not decide which of them depend on others. Eigenvalues below
+    `dependent` times the largest count as zero."""
+    finite = jnp.all(jnp.isfinite(A))
+    A = jnp.where(finite, A, jnp.eye(A.shape[0], dtype=A.dtype))
+    scale = jnp.ones_like(A)
+    if equilibrated:
+        diagonal = jax.lax.stop_gradient(jnp.diagonal(A))
+        size = jnp.where(diagonal > 0, 1 / jnp.sqrt(jnp.where(diagonal > 0, diagonal, 1)), 1)
+        scale = size[:, None] * size[None, :]
+    dependent = jax.lax.stop_gradient(jnp.asarray(dependent, A.dtype))
+    return PseudoInverse(scale * _pseudo_inverse(scale * A, dependent), finite)
+
+
+@ForwardRule
+def _pseudo_inverse(A: Float[Array, "m m"], dependent: FloatScalar) -> Float[Array, "m m"]:
+    """Of a symmetric matrix. (The derivative of `jnp.linalg.pinv` cannot be differentiated again
+    where `rtol` is an array.)"""
+    values, V = jnp.linalg.eigh(A, symmetrize_input=False)
+    used = jnp.abs(values) > dependent * jnp.max(jnp.abs(values))
+    return (V * jnp.where(used, 1 / jnp.where(used, values, 1), 0)[None, :]) @ V.T
+
+
+@_pseudo_inverse.define_jvp
+def _pseudo_inverse_jvp(P, primals, tangents):
+    """At constant rank (Golub & Pereyra 1973)."""
+    (A, _), (A_dot, _) = primals, tangents
+    one = jnp.eye(A.shape[0], dtype=A.dtype)
+    turned = P @ P @ A_dot.T @ (one - A @ P)
+    return turned + turned.T - P @ A_dot @ P
+
+
+def _factorize_with_library(A: Float[Array, "m m"]) -> Factorization:
+    size = jnp.sqrt(jnp.maximum(jnp.abs(jnp.diagonal(A)), jnp.finfo(A.dtype).tiny))
+    equilibrated, _ = jsl.lu_factor(jax.lax.stop_gradient(A / size[:, None] / size[None, :]))
+    full_rank = jnp.all(jnp.abs(jnp.diagonal(equilibrated)) > _threshold(A))
+    A = jnp.where(full_rank, A, jnp.eye(A.shape[0], dtype=A.dtype))
+    return Factorization(A, jsl.lu_factor(jax.lax.stop_gradient(A)), full_rank)
+
+
+def gram(A: Float[Array, "i n"], B: Float[Array, "k n"]) -> Float[Array, "i k"]:
+    """`A B^T`; small ones as a sum that fuses, as batched tiny `dot`s are slow."""
+    if max(A.shape[0], B.shape[0]) > UNROLL_LIMIT:
+        return A @ B.T
+    return jnp.sum(A[:, None, :] * B[None, :, :], axis=2)
+
+
+def gram_written_out(A: Float[Array, "i n"], B: Float[Array, "k n"]) -> Float[Array, "i k"]:
+    """`A B^T` for what is evaluated at every stage: more to compile, but without the reductions
+    for which XLA calls a library if the batch is large, and which then do not fuse."""
+    if max(*A.shape, B.shape[0]) > UNROLL_LIMIT:
+        return gram(A, B)
+    return sum(A[:, None, j] * B[None, :, j] for j in range(A.shape[1]))  # pyright: ignore[reportReturnType]
+
+
+class Elimination(eqx.Module):
+    """`A^-1` of any regular square matrix, by elimination with row exchanges. Not finite if `A` is
+    singular."""
+
+    A: Float[Array, "n n"]
+
+    def solve(self, b: Float[Array, "n ..."]) -> Float[Array, "n ..."]:
+        A = self.A
+        return jax.lax.custom_linear_solve(
+            lambda x: A @ x,
+            b,
+            lambda _, b: reduction(A)[0] @ b,
+            lambda _, b: reduction(A)[0].T @ b,
+        )
+
+
+def reduction(A: Float[Array, "n k"]) -> tuple[Float[Array, "n n"], FloatScalar]:
+    """`E` with `E A = 1` (or `[1; 0]` if `k < n`) and the sign of `det E`, by Gauss-Jordan
+    elimination with row exchanges. Not finite if the columns of `A` are dependent.
+
+    Without LAPACK: batched factorizations can wait for each other for ever on the CPU. Seen with
+    jaxlib 0.10.2 on two cores: two that do not depend on each other, under `vmap` in one large
+    program, each held a thread of XLA's pool and waited there for tasks in the queue of the pool.
+    """
+    n, k = A.shape
+    rows = jnp.arange(n)
+
+    def column(j, state):
+        M, sign = state
+        p = jnp.argmax(jnp.where(rows >= j, jnp.abs(M[:, j]), -1))
+        sign = sign * jnp.sign(M[p, j]) * jnp.where(p == j, 1, -1)
+        pivot_row = M[p] / M[p, j]
+        M = jnp.where((rows == p)[:, None], M[j][None], M)
+        M = jnp.where((rows == j)[:, None], pivot_row[None], M - jnp.outer(M[:, j], pivot_row))
+        return M, sign
+
+    start = jnp.concatenate([A, jnp.eye(n, dtype=A.dtype)], axis=1), jnp.ones((), A.dtype)
+    M, sign = jax.lax.fori_loop(0, k, column, start, unroll=k <= _UNROLLED_COLUMNS)
+    return M[:, k:], sign

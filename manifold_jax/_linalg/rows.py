@@ -1,0 +1,68 @@
+"""Rows of a matrix: an array, or products with them alone."""
+
+import abc
+from typing import Any, TYPE_CHECKING, TypeAlias
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from .dense import gram, UNROLL_LIMIT
+
+
+class AbstractRows(eqx.Module):
+    """Rows `C` of shape `(m, n)` that are not held as an array, for the functions below."""
+
+    @abc.abstractmethod
+    def multiply(self, x: Float[Array, " n"]) -> Float[Array, " m"]:
+        """`C x`."""
+
+    @abc.abstractmethod
+    def combine(self, weights: Float[Array, " m"]) -> Float[Array, " n"]:
+        """`C^T weights`."""
+
+    @abc.abstractmethod
+    def sizes(self, scale: Float[Array, " n"]) -> Float[Array, " m"]:
+        """`max_j |C_ij| scale_j` with positive scales."""
+
+    @abc.abstractmethod
+    def factorize(self, directions: "AbstractRows", checked: bool = True) -> Any:
+        """`C V` with the rows of `V^T`, factored: `solve(b)`, and `full_rank`. That is not known if
+        it is not checked; then look at the residuals of solutions, `solves(residual, size2)`."""
+
+    @abc.abstractmethod
+    def of_other(self, function: Any, t: Array, x: Float[Array, " n"], args: Any) -> "AbstractRows":
+        """Those of `function(t, x, args)` at `x`, of the same structure."""
+
+
+class InverseWeights(eqx.Module):
+    """A diagonal metric, given by its inverse."""
+
+    weights: Float[Array, " n"]
+
+    def solve(self, rows: Float[Array, "*k n"]) -> Float[Array, "*k n"]:
+        return rows * jnp.broadcast_to(self.weights, rows.shape)
+
+
+if TYPE_CHECKING:
+    Rows: TypeAlias = Any  # whoever knows that they are an array uses them as one
+else:
+    Rows: TypeAlias = Float[Array, "_ _"] | AbstractRows
+
+
+def combine(weights: Float[Array, " m"], rows: Rows) -> Float[Array, " n"]:
+    """`sum_i weights_i rows_i`."""
+    if isinstance(rows, AbstractRows):
+        return rows.combine(weights)
+    if rows.shape[0] > UNROLL_LIMIT:
+        return weights @ rows
+    return sum(weights[i] * rows[i] for i in range(rows.shape[0]))  # pyright: ignore[reportReturnType]
+
+
+def multiply(A: Rows, x: Float[Array, " n"]) -> Float[Array, " m"]:
+    """`A x`, not by the library either, whose batched small products are slow."""
+    if isinstance(A, AbstractRows):
+        return A.multiply(x)
+    if A.shape[1] > UNROLL_LIMIT:
+        return gram(A, x[None, :])[:, 0]
+    return combine(x, A.T)

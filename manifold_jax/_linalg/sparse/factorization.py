@@ -1,0 +1,138 @@
+"""`G V` of sparse rows, formed from products, and factored."""
+
+import dataclasses
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ..._base.types import BoolScalar, FloatScalar
+from ..rows import AbstractRows
+from .elimination import Blocks, eliminate
+from .structure import Structure
+
+
+class BlockFactorization(eqx.Module):
+    """With a flag that says whether a system with a known solution is solved to some digits: not if
+    the rank is not full, nor if an entry is missing in the structure.
+
+    The derivative is that of `G V x = b`, whatever the elimination does.
+    """
+
+    rows: AbstractRows
+    directions: AbstractRows
+    blocks: Blocks  # held fixed, as all that follows
+    eliminated: Any
+    structure: Structure = eqx.field(static=True)
+    symmetric: bool = eqx.field(static=True)
+    full_rank: BoolScalar
+
+    @staticmethod
+    def of(
+        rows, directions, structure: Structure, symmetric: bool, checked: bool
+    ) -> "BlockFactorization":
+        fixed_rows, fixed_directions = _fixed(rows), _fixed(directions)
+        product = lambda z: fixed_rows.multiply(fixed_directions.combine(z))
+        blocks = _blocks(product, structure, fixed_rows.x.dtype)
+        factorization = BlockFactorization(
+            rows, directions, blocks, eliminate(blocks), structure, symmetric, jnp.asarray(True)
+        )
+        if not checked:
+            return factorization
+        return dataclasses.replace(factorization, full_rank=factorization._is_right(product))
+
+    def solve(self, b: Float[Array, " m"]) -> Float[Array, " m"]:
+        solve = lambda multiply, b: self._refined(self.eliminated, multiply, b)
+        transposed = lambda multiply, b: self._refined(
+            eliminate(self.blocks.transposed()), multiply, b
+        )
+        return jax.lax.custom_linear_solve(
+            lambda z: self.rows.multiply(self.directions.combine(z)),
+            b,
+            solve,
+            solve if self.symmetric else transposed,
+        )
+
+    def _refined(self, eliminated: Any, multiply: Any, b: Float[Array, " m"]) -> Float[Array, " m"]:
+        """Refined once by products without the matrix, whose entries are rounded: near singular
+        positions that brings back a third of the digits. Tridiagonal matrices have none."""
+        x = _in_order(self.structure, eliminated, b)
+        if self.structure.width == 1:
+            return x
+        return x + _in_order(self.structure, eliminated, b - multiply(x))
+
+    def solves(self, residual: Float[Array, " m"], size2: FloatScalar) -> BoolScalar:
+        """Whether what a refinement would change, `x' = A^-1 r`, is small: `r . x' = x' . A x'` beside
+        the `x . A x` of solutions, `size2`. Then the rank is full, no entry is missing, and `A` is not
+        too ill conditioned for the elimination; or else `A x = b` nevertheless."""
+        r = jax.lax.stop_gradient(residual)
+        change2 = jnp.abs(jnp.dot(r, _in_order(self.structure, self.eliminated, r)))
+        tolerance = float(jnp.finfo(r.dtype).eps) ** (1 / 3)
+        return change2 <= tolerance**2 * jax.lax.stop_gradient(size2)
+
+    @property
+    def lengths(self) -> Float[Array, " m"]:
+        """Of the gradients, in the metric of the directions."""
+        structure = self.structure
+        diagonal = jnp.diagonal(self.blocks.diagonal, axis1=1, axis2=2).reshape(-1)
+        diagonal = diagonal[: structure.num_equations]
+        if structure.place is not None:
+            diagonal = diagonal[_places(structure)]
+        return jnp.sqrt(jnp.where(diagonal > 0, diagonal, 1))
+
+    def _is_right(self, product: Any) -> BoolScalar:
+        """Of a system with a known solution: equations of any units."""
+        lengths = self.lengths
+        mixed = jnp.arange(lengths.size, dtype=jnp.uint32) * jnp.uint32(2654435769)
+        known = jnp.where(mixed >> 31 == 0, 1, -1).astype(lengths.dtype)  # signs without a pattern
+        solution = self._refined(self.eliminated, product, product(known / lengths))
+        error = jnp.max(jnp.abs(solution * lengths - known))
+        # Without full rank it is as large as the solution. Long chains are ill conditioned, so that
+        # little can be asked for in single precision: 1e-4 (2e-2).
+        return error <= float(jnp.finfo(lengths.dtype).eps) ** (1 / 4)
+
+
+def _fixed(rows: Any) -> Any:
+    hold = lambda leaf: jax.lax.stop_gradient(leaf) if eqx.is_inexact_array(leaf) else leaf
+    return jax.tree_util.tree_map(hold, rows)
+
+
+def _places(structure: Structure) -> Array:
+    """Of the equations in the order of elimination. Behind a barrier, as the compiler would evaluate
+    what follows from it by itself, slowly."""
+    if structure.place is None:
+        return jax.lax.optimization_barrier(jnp.arange(structure.num_equations, dtype=jnp.int32))
+    return jax.lax.optimization_barrier(jnp.asarray(structure.place))
+
+
+def _blocks(product: Any, structure: Structure, dtype: Any) -> Blocks:
+    """Of every third block one column at a time: three colors of blocks do not meet."""
+    width, groups = structure.width, structure.num_blocks // 3
+    places = _places(structure)
+    wanted = jnp.arange(3 * width, dtype=jnp.int32)[:, None]
+    column = (places // width) % 3 * width + places % width
+    products = jax.vmap(product)((column[None, :] == wanted).astype(dtype))
+    missing = 3 * groups * width - structure.num_equations
+    products = jnp.pad(_ordered(structure, products.T), ((0, missing), (0, 0)))
+    entries = products.reshape(groups, 3, width, 3, width)  # block, row; color, column
+    beside = lambda shift: jnp.stack(
+        [entries[:, r, :, (r + shift) % 3, :] for r in range(3)], axis=1
+    ).reshape(3 * groups, width, width)
+    is_padding = (jnp.arange(3 * groups * width) >= structure.num_equations).astype(dtype)
+    diagonal = beside(0) + jax.vmap(jnp.diag)(is_padding.reshape(-1, width))
+    return Blocks(beside(-1), diagonal, beside(1))
+
+
+def _ordered(structure: Structure, b: Float[Array, "m ..."]) -> Float[Array, "m ..."]:
+    if structure.order is None:
+        return b
+    return b[jax.lax.optimization_barrier(jnp.asarray(structure.order))]
+
+
+def _in_order(structure: Structure, eliminated: Any, b: Float[Array, " m"]) -> Float[Array, " m"]:
+    m, width = structure.num_equations, structure.width
+    padded = jnp.pad(_ordered(structure, b), (0, structure.num_blocks * width - m))
+    z = eliminated.solve(padded.reshape(-1, width)).reshape(-1)[:m]
+    return z if structure.place is None else z[_places(structure)]

@@ -1,0 +1,1 @@
+"""One step of any Diffrax solver, with the constraint corrected inside or after it."""

@@ -1,0 +1,30 @@
+"""In what a step is computed: the state itself, or coordinates near it."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+from ..._base.types import RealScalarLike, Y
+from ..._constraint.projection_info import ProjectionInfo
+
+
+class Frame(NamedTuple):
+    """The coordinates `w` that one step of a solver advances.
+
+    - `origin`: those of the state `y0` at which the step begins.
+    - `terms`: the differential equation for them, evaluated at stages.
+    - `correct`: the state on the manifold that belongs to them at the end of the step.
+    - `pull_back`: `(t, w, y, vector)`, the velocity of coordinates of one of the state.
+    - `state`: for dense output, `(y0, w)`: a state near that of the coordinates; `None` if it is
+        `w` itself.
+    """
+
+    origin: Y
+    terms: Any
+    correct: Callable[[Y], tuple[Y, ProjectionInfo]]
+    pull_back: Callable[[RealScalarLike, Y, Y, Y], Y]
+    state: Callable[[Y, Y], Y] | None = None
+
+    @staticmethod
+    def of_state(y0: Y, terms: Any, correct: Callable[[Y], tuple[Y, ProjectionInfo]]) -> "Frame":
+        """The state as its own coordinates."""
+        return Frame(y0, terms, correct, lambda t, w, y, vector: vector)

@@ -1,0 +1,198 @@
+"""Problems of the gallery with some of their numbers drawn at random."""
+
+import math
+import re
+from typing import Any, NamedTuple
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.flatten_util as jfu
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+import typer
+from jaxtyping import Array
+
+from ..._constraint.constraint import AbstractConstraint
+from ...problems import Problem
+from .arguments import check_name
+
+
+class Distribution(NamedTuple):
+    """Of one number: its name, the kind, and the two numbers that describe it."""
+
+    target: str
+    kind: str
+    a: float
+    b: float
+
+    def draw(self, key: Array, dtype: Any) -> Array:
+        if self.kind == "normal":
+            return self.a + self.b * jax.random.normal(key, dtype=dtype)
+        if self.kind == "uniform":
+            return jax.random.uniform(key, dtype=dtype, minval=self.a, maxval=self.b)
+        a, b = math.log(self.a), math.log(self.b)
+        return jnp.exp(jax.random.uniform(key, dtype=dtype, minval=a, maxval=b))
+
+    def __str__(self) -> str:
+        return f"{self.target}={self.kind}({self.a}, {self.b})"
+
+
+# Of each what its two numbers have to be.
+_KINDS = {
+    "uniform": ("uniform(low, high) needs low < high", lambda a, b: a < b),
+    "normal": ("normal(mean, std) needs std > 0", lambda a, b: b > 0),
+    "loguniform": ("loguniform(low, high) needs 0 < low < high", lambda a, b: 0 < a < b),
+}
+_HINT = "--vary"
+
+
+def distributions(texts: list[str], problem: Problem) -> list[Distribution]:
+    """Of `NAME=KIND(A,B)` each, or an error that says what could have been asked for."""
+    known = list(_places(problem))
+    out: list[Distribution] = []
+    for text in texts:
+        match = re.fullmatch(r"\s*([\w.]+)\s*=\s*(\w+)\s*\(([^,()]+),([^,()]+)\)\s*", text)
+        if match is None:
+            example = f"{known[0]}=uniform(0.5,2)"
+            raise typer.BadParameter(f"{text!r} is not of the form {example!r}.", param_hint=_HINT)
+        target, kind = match[1], match[2].lower()
+        check_name(target, known, f"number of `{problem.name}`", _HINT)
+        check_name(kind, _KINDS, "distribution", _HINT)
+        if any(target == before.target for before in out):
+            raise typer.BadParameter(f"{target!r} is varied twice.", param_hint=_HINT)
+        out.append(Distribution(target, kind, *_numbers(text, kind, match[3], match[4])))
+        _check_positive(out[-1], text)
+    return out
+
+
+# Parts of names whose numbers have a sign: of a negative mass there is a solution, but no mechanism.
+_POSITIVE = ("length", "mass", "inertia", "radius")
+
+
+def _check_positive(one: Distribution, text: str) -> None:
+    name = next((word for word in _POSITIVE if word in one.target), None)
+    if one.kind == "uniform" and name is not None and one.target.startswith("args") and one.a <= 0:
+        raise typer.BadParameter(
+            f"{text!r} draws values that are not positive, but `{one.target}` is a {name}. Write "
+            f"`{one.target}=uniform(LOW, HIGH)` with 0 < LOW, or `loguniform`.",
+            param_hint=_HINT,
+        )
+
+
+def _numbers(text: str, kind: str, *words: str) -> tuple[float, float]:
+    needs, is_met = _KINDS[kind]
+    try:
+        a, b = (float(word) for word in words)
+    except ValueError:
+        a = b = math.nan
+    if not (math.isfinite(a) and math.isfinite(b) and is_met(a, b)):
+        raise typer.BadParameter(f"{needs}, got {text!r}.", param_hint=_HINT)
+    return a, b
+
+
+class Given(NamedTuple):
+    """What one trajectory has of its own besides its start: parameters, the arrays of its
+    constraint (values of invariants) and what was drawn, by name."""
+
+    args: Any
+    constraint: Any
+    drawn: dict[str, Array]
+
+
+class VariedProblem:
+    """Trajectories of a problem with numbers drawn from distributions: initial state and constraint
+    are rebuilt for the parameters of each, then components of its initial state are set."""
+
+    def __init__(self, problem: Problem, varied: list[Distribution]):
+        self.problem, self.varied = problem, varied
+        self.terms = dfx.ODETerm(lambda t, y, given: problem.terms.vf(t, y, given.args))
+        self.constraint = ConstraintInArgs(
+            template=problem.constraint, redundant=problem.constraint.redundant
+        )
+
+    def __repr__(self) -> str:
+        """As the settings of the folder have it."""
+        return f"{self.problem.name} with {', '.join(map(str, self.varied))}"
+
+    def sample(self, index: Array, key: Array) -> tuple[Any, Given]:
+        del index
+        keys = jax.random.split(key, len(self.varied))
+        places = _places(self.problem)
+        drawn = {
+            one.target: one.draw(k, places[one.target].dtype)
+            for one, k in zip(self.varied, keys, strict=True)
+        }
+        problem = self.problem
+        of_args = {name: x for name, x in drawn.items() if name.startswith("args")}
+        if of_args:
+            problem = problem.with_args(_replaced("args", problem.args, of_args))
+        if len(of_args) < len(drawn):
+            problem = problem.with_initial(_replaced("y0", problem.y0, drawn))
+        return problem.y0, Given(problem.args, eqx.filter(problem.constraint, eqx.is_array), drawn)
+
+    def saved(self, t: Any, y: Any, given: Given) -> dict[str, Any]:
+        """The state, by how much it violates the constraint (absolute), and what was drawn."""
+        residual = jfu.ravel_pytree(self.constraint(t, y, given))[0]
+        return {"y": y, "violation": jnp.max(jnp.abs(residual)), "varied": given.drawn}
+
+
+class ConstraintInArgs(AbstractConstraint):
+    """A constraint whose arrays are those of each trajectory, in [`Given`][]."""
+
+    template: AbstractConstraint
+    redundant: bool = eqx.field(static=True)
+
+    def _of(self, given: Given) -> AbstractConstraint:
+        return eqx.combine(given.constraint, self.template)
+
+    def __call__(self, t: Any, y: Any, args: Any = None) -> Any:
+        return self._of(args)(t, y, args.args)
+
+    def correct(self, projection: Any, t: Any, y: Any, args: Any = None, **options: Any) -> Any:
+        return self._of(args).correct(projection, t, y, args.args, **options)
+
+    def normals(self, projection: Any, t: Any, y: Any, args: Any = None) -> Any:
+        return self._of(args).normals(projection, t, y, args.args)
+
+    def push_forward(self, t: Any, y: Any, args: Any, directions: Any, vector: Any) -> Any:
+        return self._of(args).push_forward(t, y, args.args, directions, vector)
+
+    def structure_at(self, t: Any, y: Any, args: Any = None) -> Any:
+        return self._of(args).structure_at(t, y, args.args)
+
+    def faults(self, t: Any, y: Any, args: Any = None) -> Any:
+        return self._of(args).faults(t, y, args.args)
+
+
+class _Place(NamedTuple):
+    """Of a number in a tree of arrays."""
+
+    leaf: int
+    index: tuple[int, ...]
+    dtype: Any
+
+
+def _places(problem: Problem) -> dict[str, _Place]:
+    """Of every number that can be varied, by name: `args.length`, `y0.0.1`."""
+    return {**_places_in("args", problem.args), **_places_in("y0", problem.y0)}
+
+
+def _places_in(name: str, tree: Any) -> dict[str, _Place]:
+    out = {}
+    for k, (path, leaf) in enumerate(jtu.tree_flatten_with_path(tree)[0]):
+        words = jtu.keystr(path, simple=True, separator=".")
+        for index in np.ndindex(*leaf.shape):
+            out[".".join(filter(None, [name, words, *map(str, index)]))] = _Place(
+                k, index, leaf.dtype
+            )
+    return out
+
+
+def _replaced(name: str, tree: Any, drawn: dict[str, Array]) -> Any:
+    leaves, treedef = jtu.tree_flatten(tree)
+    for target, place in _places_in(name, tree).items():
+        if target in drawn:
+            leaves[place.leaf] = leaves[place.leaf].at[place.index].set(drawn[target])
+    return jtu.tree_unflatten(treedef, leaves)

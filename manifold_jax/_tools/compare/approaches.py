@@ -1,0 +1,161 @@
+"""The approaches to a manifold: each turns a problem into terms and a solver for Diffrax."""
+
+import dataclasses
+from collections.abc import Callable
+from importlib.metadata import entry_points
+from typing import Any, NamedTuple
+
+import diffrax as dfx
+import equinox as eqx
+
+from ..._constraint.settings import NewtonProjection
+from ..._mechanics import Baumgarte
+from ..._solve import diffeqsolve
+from ..._solver import LocalCoordinates, Projected, Stabilized
+from ..._solver.chart import CoordinatePartitionChart, TangentSpaceChart
+from ..._solver.stabilization import ExactStabilization, InvariantStabilization
+from ...problems import Problem
+
+
+class Formulation(NamedTuple):
+    """What to integrate: the function that solves, and its first two arguments."""
+
+    function: Callable[..., dfx.Solution]
+    terms: dfx.AbstractTerm
+    solver: dfx.AbstractSolver
+
+
+@dataclasses.dataclass(frozen=True)
+class Need:
+    """What not every problem has: the attribute that is None then, and what it is called."""
+
+    attribute: str
+    phrase: str
+
+    def is_met_by(self, problem: Problem) -> bool:
+        return getattr(problem, self.attribute) is not None
+
+    def __str__(self) -> str:
+        return f"needs {self.phrase}"
+
+
+SYSTEM = Need("system", "a mechanical system")
+CHART = Need("chart", "a chart of its own")
+
+
+class Style(NamedTuple):
+    """How a curve is drawn: colour-blind safe (Okabe & Ito), related approaches share a hue."""
+
+    colour: str
+    line: str = "solid"
+
+
+@dataclasses.dataclass(frozen=True)
+class Approach:
+    """One way to keep a solution on (or near) a manifold: all that tables, pictures, certificates
+    and benchmarks know of it.
+
+    - `name`: on the command line and in tables.
+    - `formulate`: of a problem, a Diffrax solver and a gain (1/time, for stabilization).
+    - `style`: in pictures.
+    - `needs`: what a problem has to have, `None` if it is for all.
+    - `uses_gain`: whether the gain matters.
+
+    Those of other packages are found by the entry point group `manifold_jax.approaches`, each a
+    module-level `Approach`.
+    """
+
+    name: str
+    formulate: Callable[[Problem, dfx.AbstractSolver, float], Formulation]
+    style: Style
+    needs: Need | None = None
+    uses_gain: bool = False
+
+
+def default_gain(problem: Problem) -> float:
+    """Violations decay by `exp(-30)` in the time span of the problem.
+
+    Measured on seven problems of the gallery (Tsit5, tolerances 1e-4 to 1e-8): ten times that
+    gain takes up to 6 times as many steps, for violations at most 4 times smaller.
+    """
+    return 30 / (problem.t1 - problem.t0)
+
+
+def _plain(problem: Problem, solver: dfx.AbstractSolver, gain: float) -> Formulation:
+    del gain
+    return Formulation(dfx.diffeqsolve, problem.terms, solver)
+
+
+def _projected(problem: Problem, solver: dfx.AbstractSolver, gain: float) -> Formulation:
+    del gain
+    return Formulation(diffeqsolve, problem.terms, Projected(solver, problem.constraint))
+
+
+def _one_step(problem: Problem, solver: dfx.AbstractSolver, gain: float) -> Formulation:
+    del gain
+    hook = Projected(solver, problem.constraint, projection=NewtonProjection(max_steps=1))
+    return Formulation(diffeqsolve, problem.terms, hook)
+
+
+def _invariant(problem: Problem, solver: dfx.AbstractSolver, gain: float) -> Formulation:
+    hook = Stabilized(solver, problem.constraint, stabilization=InvariantStabilization(gain))
+    return Formulation(diffeqsolve, problem.terms, hook)
+
+
+def _exact(problem: Problem, solver: dfx.AbstractSolver, gain: float) -> Formulation:
+    hook = Stabilized(solver, problem.constraint, stabilization=ExactStabilization(gain))
+    return Formulation(diffeqsolve, problem.terms, hook)
+
+
+def _baumgarte(problem: Problem, solver: dfx.AbstractSolver, gain: float) -> Formulation:
+    """Critical damping."""
+    assert problem.system is not None
+    stabilization = Baumgarte(gain, gain)
+    system = eqx.tree_at(
+        lambda s: s.stabilization, problem.system, stabilization, is_leaf=lambda x: x is None
+    )
+    return Formulation(dfx.diffeqsolve, system.terms, solver)
+
+
+def _tangent(problem: Problem, solver: dfx.AbstractSolver, gain: float) -> Formulation:
+    del gain
+    hook = LocalCoordinates(solver, problem.constraint, chart=TangentSpaceChart())
+    return Formulation(diffeqsolve, problem.terms, hook)
+
+
+def _partition(problem: Problem, solver: dfx.AbstractSolver, gain: float) -> Formulation:
+    del gain
+    hook = LocalCoordinates(solver, problem.constraint, chart=CoordinatePartitionChart())
+    return Formulation(diffeqsolve, problem.terms, hook)
+
+
+def _lie_group(problem: Problem, solver: dfx.AbstractSolver, gain: float) -> Formulation:
+    del gain
+    assert problem.chart is not None
+    hook = LocalCoordinates(solver, problem.constraint, chart=problem.chart)
+    return Formulation(diffeqsolve, problem.terms, hook)
+
+
+def _of_other_packages() -> tuple[Approach, ...]:
+    found = entry_points(group="manifold_jax.approaches")
+    return tuple(point.load() for point in sorted(found, key=lambda point: point.name))
+
+
+# In the order of the tables.
+APPROACHES: tuple[Approach, ...] = (
+    Approach("plain", _plain, Style("#D55E00")),
+    Approach("projected", _projected, Style("#0072B2")),
+    Approach("one-step", _one_step, Style("#56B4E9", "dashed")),
+    Approach("invariant", _invariant, Style("#009E73"), uses_gain=True),
+    Approach("exact", _exact, Style("#009E73", "dashed"), uses_gain=True),
+    Approach("baumgarte", _baumgarte, Style("#E69F00"), needs=SYSTEM, uses_gain=True),
+    Approach("tangent", _tangent, Style("#CC79A7")),
+    Approach("partition", _partition, Style("#CC79A7", "dashed")),
+    Approach("lie-group", _lie_group, Style("#CC79A7", "dotted"), needs=CHART),
+    *_of_other_packages(),
+)
+
+
+def with_vector_field(terms: Any, wrap: Callable[[Callable], Callable]) -> Any:
+    """The same terms with `wrap(f)` in place of their vector field `f(t, y, args)`."""
+    return eqx.tree_at(lambda term: term.vector_field, terms, wrap(terms.vector_field))

@@ -1,0 +1,180 @@
+"""Tables for the terminal and files for programs."""
+
+import inspect
+import json
+import math
+import re
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import diffrax
+import jax
+import jax.flatten_util as jfu
+import jax.tree_util as jtu
+import numpy as np
+import scipy
+from rich.markup import escape
+from rich.table import Table
+
+from ... import __version__
+from ...problems import Problem
+from .approaches import APPROACHES
+from .methods import Measurement, Method
+from .task import OUTPUT_POINTS, Task
+
+
+# The methods for which the gain is.
+
+
+def sizes(problem: Problem) -> tuple[int, int]:
+    """The number of states and the number of constraints, `n` and `m`."""
+    residual = jax.eval_shape(problem.constraint, problem.t0, problem.y0, problem.args)
+    return (
+        jfu.ravel_pytree(problem.y0)[0].size,
+        sum(math.prod(leaf.shape) for leaf in jtu.tree_leaves(residual)),
+    )
+
+
+def gallery_table(gallery: dict[str, Callable[[], Problem]]) -> Table:
+    table = Table()
+    table.add_column("name")
+    table.add_column("n", justify="right")
+    table.add_column("m", justify="right")
+    table.add_column("time span")
+    table.add_column("solution")
+    table.add_column("description", min_width=20)  # the only one to be wrapped
+    for name, build in gallery.items():
+        problem = build()
+        table.add_row(
+            name,
+            *map(str, sizes(problem)),
+            f"{problem.t0:.4g} to {problem.t1:.4g}",
+            "at the end" if problem.reference_at_end_only else "all times",
+            escape(summary(build)),
+        )
+    return table
+
+
+def summary(build: Callable[[], Problem]) -> str:
+    """What a problem is, in one line: the beginning of its docstring, without mathematics."""
+    paragraph = (inspect.getdoc(build) or "").partition("\n\n")[0]
+    text = " ".join(paragraph.split())
+    return re.split(r"[,:.]( |$)", text, maxsplit=1)[0].replace("$", "")
+
+
+def comparison_title(task: Task) -> str:
+    span = f"t = {task.t0:g} to {task.t1:g}"
+    return f"{task.problem.name}, {task.solver}, {span}, rtol = {task.rtol:g}, atol = {task.atol:g}"
+
+
+def comparison_table(measurements: Sequence[Measurement]) -> Table:
+    table = Table()
+    table.add_column("method")
+    # short, so that they fit in a terminal of 80 columns
+    for heading in (
+        "steps\naccepted",
+        "\nrejected",
+        "field\ncalls",
+        "|g| at\nsteps",
+        "|g| at\noutput",
+        "error of\nstate",
+        "run\n(ms)",
+        "compile\n(s)",
+    ):
+        table.add_column(heading, justify="right")
+    for measurement in measurements:
+        row = measurement.row
+        table.add_row(
+            measurement.key,
+            _number(row.accepted, "d"),
+            _number(row.rejected, "d"),
+            _number(row.evaluations, "d"),
+            _number(row.violation_steps, ".1e"),
+            _number(row.violation_output, ".1e"),
+            _number(row.error, ".1e") if measurement.failure is None else "failed",
+            _number(row.run_ms, ".3g" if (row.run_ms or 0) < 100 else ".0f"),
+            _number(row.compile_s, ".2f"),
+        )
+    return table
+
+
+def _number(value: int | float | None, fmt: str) -> str:
+    return "-" if value is None else format(value, fmt)
+
+
+def comparison_notes(
+    task: Task, measurements: Sequence[Measurement], left_out: Sequence[Method]
+) -> list[str]:
+    """How to read the table, below it."""
+    if task.reference() is None:
+        known = "is not known for this time span (without --t1 it is)"
+    elif task.problem.reference_at_end_only:
+        known = f"is known at t = {task.t1:g} only: error there"
+    else:
+        known = "is known"
+    failures = [f"{m.key} failed: {m.failure}." for m in measurements if m.failure is not None]
+    notes = [
+        *failures,
+        f"Largest |g| and error; output at {OUTPUT_POINTS} times; the solution {known}.",
+        "Run: median, output included. SciPy calls the compiled field from Python and does not "
+        "report rejected steps.",
+    ]
+    with_gain = {approach.name for approach in APPROACHES if approach.uses_gain}
+    stabilized = [m.key for m in measurements if m.key in with_gain]
+    if stabilized:
+        notes.append(
+            f"Stabilization ({', '.join(stabilized)}) with gain {task.gain:.3g} per unit of time; "
+            "its states are handed out uncorrected."
+        )
+    for method in left_out:
+        notes.append(f"Left out: {method.key}, which {method.needs}.")
+    limit = max_steps(measurements)
+    return notes if limit is None else [*notes, f"Step limit chosen for Diffrax: {limit}."]
+
+
+def max_steps(measurements: Sequence[Measurement]) -> int | None:
+    """The largest limit that a solve needed."""
+    limits = [m.max_steps for m in measurements if m.max_steps is not None]
+    return max(limits, default=None)
+
+
+def write_json(
+    path: Path, task: Task, measurements: Sequence[Measurement], left_out: Sequence[Method]
+) -> None:
+    """Everything in the table and how it was made. Unknown numbers are null."""
+    n, m = sizes(task.problem)
+    settings = {
+        "solver": task.solver,
+        "rtol": task.rtol,
+        "atol": task.atol,
+        "gain": task.gain,
+        "t0": task.t0,
+        "t1": task.t1,
+        "output_points": OUTPUT_POINTS,
+        "max_steps": max_steps(measurements),
+        "states": n,
+        "constraints": m,
+        "device": jax.devices()[0].device_kind,
+        "versions": {
+            "manifold_jax": __version__,
+            "diffrax": diffrax.__version__,
+            "jax": jax.__version__,
+            "numpy": np.__version__,
+            "scipy": scipy.__version__,
+        },
+        "failures": {m.row.method: m.failure for m in measurements if m.failure is not None},
+        "left_out": {method.name(task): str(method.needs) for method in left_out},
+    }
+    rows = [vars(measurement.row) for measurement in measurements]
+    content = {"problem": task.problem.name, "settings": settings, "rows": rows}
+    path.write_text(json.dumps(_strict(content), indent=2, allow_nan=False) + "\n")
+
+
+def _strict(value: Any) -> Any:
+    """JSON has neither NaN nor infinity."""
+    if isinstance(value, dict):
+        return {key: _strict(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [_strict(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -1,0 +1,55 @@
+"""SciPy's solvers on the same vector field, as a yardstick."""
+
+import warnings
+from typing import Any
+
+import jax
+import jax.flatten_util as jfu
+import numpy as np
+import scipy.integrate
+
+from .task import median_ms, Run, SolveFailed, Task
+
+
+def run_scipy(task: Task, method: str) -> Run:
+    """`scipy.integrate.solve_ivp`, which calls the compiled vector field from Python.
+
+    SciPy does not report rejected steps. Evaluations are those of the timed run with
+    output on the grid (DOP853 needs three more per step for it); LSODA's contain the
+    differences for its Jacobians.
+    """
+    problem = task.problem
+
+    @jax.jit
+    def field(t, x):
+        return jfu.ravel_pytree(problem.terms.vf(t, task.unravel(x), problem.args))[0]
+
+    def solve(grid: np.ndarray | None) -> Any:
+        with warnings.catch_warnings():
+            # about tolerances that it raises, and steps that fail: the result says it too
+            warnings.simplefilter("ignore")
+            return scipy.integrate.solve_ivp(
+                lambda t, x: np.asarray(field(t, x)),
+                (task.t0, task.t1),
+                task.initial_row(),
+                method,
+                t_eval=grid,
+                rtol=task.rtol,
+                atol=task.atol,
+            )
+
+    on_steps = solve(None)  # compiles the vector field too
+    if not on_steps.success:
+        raise SolveFailed(on_steps.message)
+    on_grid = solve(task.grid)
+    return Run(
+        output=on_grid.y.T,
+        step_times=on_steps.t[1:],
+        steps=on_steps.y.T[1:],
+        accepted=len(on_steps.t) - 1,
+        rejected=None,
+        evaluations=int(on_grid.nfev),
+        run_ms=median_ms(lambda: solve(task.grid)),
+        compile_s=None,
+        max_steps=None,
+    )
