@@ -1,1 +1,1 @@
-"""Benchmarks: programs to be run, `python -m benchmarks.overhead` and so on (see README.md)."""
+"""Benchmarks: programs to be run, `python -m benchmarks.speed.overhead` and so on (see README.md)."""

@@ -1,4 +1,4 @@
-"""Every benchmark runs: with the smallest settings, for what crashes, not for what it measures."""
+"""Benchmarks run with the smallest settings: for what crashes, not for what they measure."""
 
 import contextlib
 import importlib
@@ -14,24 +14,49 @@ import pytest
 ROOT = Path(__file__).parents[1]
 sys.path.append(str(ROOT))
 
-MODULES = sorted(path.stem for path in (ROOT / "benchmarks").glob("[a-z_]*.py"))
+FOLDERS = ("dae_board", "peers", "speed", "tools")
+MODULES = sorted(
+    ".".join(path.relative_to(ROOT).with_suffix("").parts)
+    for folder in FOLDERS
+    for path in (ROOT / "benchmarks" / folder).glob("*.py")
+)
+PROGRAMS = {
+    module
+    for module in MODULES
+    if "\ndef main(" in (ROOT / f"{module.replace('.', '/')}.py").read_text()
+}
 # Of others, and not needed for anything else.
 PEERS = ("casadi", "mujoco", "pydiffsol", "sksundae")
-# Without those that compile or train for a minute and more (`gradients`, `neural`, `overhead`, `thresholds`) and
-# `fuzz`, which has tests of its own.
 SMALLEST = {
-    "accelerator": dict(sizes="4", lanes=2, repeats=1, problems="lorenz", precisions="double"),
-    "approaches": dict(problems="pendulum", repeats=1, quick=True),
-    "closed_forms": dict(repeats=1),
-    "compile_time": dict(compilations=1, repeats=1, only="pendulum"),
-    "dae_board": dict(problems="linear: generator", quick=True, repeats=1),
-    "devices": dict(size=4, repeats=1),
-    "ensemble": dict(size=4, lanes=2, repeats=1, problems="pendulum", saved=2, pendulums=4),
-    "mujoco_peers": dict(),
-    "pendulum_peers": dict(repeats=1),
-    "polymer": dict(bonds=6, long=1.0, repeats=1, quick=True),
+    "benchmarks.dae_board.__main__": dict(problems="linear: generator", quick=True, repeats=1),
+    "benchmarks.peers.approaches": dict(problems="pendulum", repeats=1, quick=True),
+    "benchmarks.peers.mujoco_peers": dict(),
+    "benchmarks.peers.pendulum_peers": dict(repeats=1),
+    "benchmarks.peers.polymer": dict(bonds=6, long=1.0, repeats=1, quick=True),
+    "benchmarks.speed.accelerator": dict(
+        sizes="4", lanes=2, repeats=1, problems="lorenz", precisions="double"
+    ),
+    "benchmarks.speed.closed_forms": dict(repeats=1),
+    "benchmarks.speed.compile_time": dict(compilations=1, repeats=1, only="pendulum"),
+    "benchmarks.speed.devices": dict(size=4, repeats=1),
+    "benchmarks.speed.ensemble": dict(
+        size=4, lanes=2, repeats=1, problems="pendulum", saved=2, pendulums=4
+    ),
+    "benchmarks.speed.ensemble_gradients": dict(sizes="4", repeats=1, problems="pendulum"),
 }
-QUICK = ("accelerator",)
+# Those that compile or train for minutes whatever their settings: imported, not run.
+TOO_LONG = {
+    "benchmarks.peers.mechanisms_mujoco",
+    "benchmarks.peers.neural",
+    "benchmarks.peers.stiff",
+    "benchmarks.speed.adaptive_gradients",
+    "benchmarks.speed.bandwidths",
+    "benchmarks.speed.gradients",
+    "benchmarks.speed.overhead",
+    "benchmarks.speed.scaling",
+    "benchmarks.speed.thresholds",
+}
+QUICK = ("benchmarks.speed.accelerator",)
 
 
 @contextlib.contextmanager
@@ -65,7 +90,11 @@ def as_before(monkeypatch):
 @pytest.mark.parametrize("name", MODULES)
 def test_imports(name):
     with without_peers():
-        importlib.import_module(f"benchmarks.{name}")
+        importlib.import_module(name)
+
+
+def test_every_program_is_run_or_named():
+    assert PROGRAMS == set(SMALLEST) | TOO_LONG
 
 
 @pytest.mark.usefixtures("as_before")
@@ -75,6 +104,6 @@ def test_imports(name):
 def test_runs(name, tmp_path, capsys):
     file = tmp_path / "result.json"
     with without_peers():
-        importlib.import_module(f"benchmarks.{name}").main(json=file, **SMALLEST[name])
+        importlib.import_module(name).main(json=file, **SMALLEST[name])
     assert capsys.readouterr().out.strip()
     assert json.loads(file.read_text())["environment"]["versions"]["jax"] == jax.__version__

@@ -9,13 +9,13 @@ import pytest
 
 sys.path.append(str(Path(__file__).parents[1]))
 
-from benchmarks import _fuzz_checks as checks, fuzz
-from benchmarks._fuzz_families import Quadrics
-from benchmarks._fuzz_lanes import amplification, draw, FAILING, reference_paths
-from benchmarks._fuzz_mechanics import Linkage, Rolling
-from benchmarks._fuzz_program import FRACTIONS
-from benchmarks._fuzz_reference import jacobian, violations
-from benchmarks._fuzz_structure import Structure, structure
+from tests.fuzz import __main__ as fuzz, checks
+from tests.fuzz.families import Quadrics
+from tests.fuzz.lanes import amplification, draw, FAILING, reference_paths
+from tests.fuzz.mechanics import Linkage, Rolling
+from tests.fuzz.program import FRACTIONS
+from tests.fuzz.reference import jacobian, violations
+from tests.fuzz.structure import Structure, structure
 
 
 DRAWS = 6

@@ -9,7 +9,7 @@ import pytest
 import scipy.integrate
 
 import manifold_jax as mj
-from benchmarks import _andrews, _stiff_problems
+from benchmarks.tools import andrews, stiff_problems
 from manifold_jax.problems.car_axis import CarAxisArgs, END as CAR_AXIS_END
 
 
@@ -283,7 +283,7 @@ def test_an_implicit_equation():
 
 @pytest.mark.slow
 def test_akzo_nobel():
-    published = _stiff_problems.PROBLEMS["chemical Akzo Nobel"]
+    published = stiff_problems.PROBLEMS["chemical Akzo Nobel"]
     start = jnp.array(published.y0)
     dae = mj.reduce_dae(models.akzo_nobel, start)
     assert dae.report.lifted == ("x[5]",)
@@ -335,17 +335,17 @@ def test_car_axis():
 
 @pytest.mark.slow
 def test_andrews():
-    model = models.mechanism(_andrews._mass, _andrews._loops, _andrews._force)
-    args = _andrews.AndrewsArgs()
-    x = {"q": jnp.asarray(_andrews.START), "v": jnp.zeros(7), "force": jnp.zeros(6)}
+    model = models.mechanism(andrews._mass, andrews._loops, andrews._force)
+    args = andrews.AndrewsArgs()
+    x = {"q": jnp.asarray(andrews.START), "v": jnp.zeros(7), "force": jnp.zeros(6)}
     dae = mj.reduce_dae(model, x, args)
     assert (dae.report.index, dae.report.degrees_of_freedom) == (3, 2)
     z0, _ = dae.consistent_state(0.0, x, args)
     at_start, rates = jax.jit(dae.outputs)(0.0, z0, args)
-    np.testing.assert_allclose(rates["v"][:2], _andrews.ACCELERATIONS, rtol=1e-10)
-    np.testing.assert_allclose(at_start["force"][:2], _andrews.MULTIPLIERS, rtol=1e-10)
+    np.testing.assert_allclose(rates["v"][:2], andrews.ACCELERATIONS, rtol=1e-10)
+    np.testing.assert_allclose(at_start["force"][:2], andrews.MULTIPLIERS, rtol=1e-10)
     z = solve(dae.terms, dae.constraint, z0, args, 0.03, 1e-12).ys[-1]
-    np.testing.assert_allclose(z[:7], _andrews.END, rtol=1e-9)
+    np.testing.assert_allclose(z[:7], andrews.END, rtol=1e-9)
 
 
 # Initial values

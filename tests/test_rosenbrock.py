@@ -10,7 +10,7 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
 import manifold_jax as mj
-from benchmarks._stiff_problems import (
+from benchmarks.tools.stiff_problems import (
     MECHANISM_START,
     PROBLEMS,
     stiff_mechanism,

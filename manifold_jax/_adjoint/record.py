@@ -17,7 +17,7 @@ from .._base.types import IntScalar
 
 # A block whose arrays are small, as XLA for CPUs sees them, which then runs the operations of a loop one
 # after the other instead of handing them to threads. With larger ones gradients take 1.3 times as
-# long with jaxlib 0.10.2, and as long with 0.12.0.1 (`python -m benchmarks.thresholds`).
+# long with jaxlib 0.10.2, and as long with 0.12.0.1 (`python -m benchmarks.speed.thresholds`).
 _SMALL, _FEWEST = 512, 8
 # States that are all kept: as many as fit into this, and not more than a batch has use for, as
 # memory that is not in a cache takes longer to fill than a small state to compute again.

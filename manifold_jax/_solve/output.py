@@ -17,7 +17,7 @@ from .._solver.base import AbstractManifoldSolver
 
 # Outputs up to which they are corrected one by one, in a program that compiles in two thirds of the
 # time; of 1001 the pendulum's take 1.2 us more each than all at once. `python -m
-# benchmarks.compile_time`.
+# benchmarks.speed.compile_time`.
 MOST_ONE_BY_ONE = 128
 
 

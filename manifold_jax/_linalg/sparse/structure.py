@@ -17,7 +17,7 @@ from .pattern import dependence
 Choice: TypeAlias = Literal["auto", "dense", "sparse"]
 
 # Equations from which on, and part of their number up to which blocks may be wide, so that the
-# sparse form is the faster one: `python -m benchmarks.bandwidths`.
+# sparse form is the faster one: `python -m benchmarks.speed.bandwidths`.
 _SMALLEST = 32
 _WIDEST = 1 / 6
 

@@ -26,7 +26,7 @@ from .frame import Frame
 # Equations of the vector field times stages. With up to 210 (rigid body) a loop over the stages takes
 # 1.1 to 1.3 times as long as written out ones alone, and 1.7 to 2.7 times in a batch; from 1278
 # (double pendulum) 0.65 to 0.9 times, and 1830 equations (slider-crank) compile in 0.8 of the time.
-# jaxlib 0.10.2 and 0.12.0.1, `python -m benchmarks.thresholds`.
+# jaxlib 0.10.2 and 0.12.0.1, `python -m benchmarks.speed.thresholds`.
 LARGEST_UNROLLED = 500
 
 
@@ -146,7 +146,7 @@ def derivative_once(y: Y, like: Y) -> Y:
     XLA for CPUs copies sums and products into every kernel that needs them, here the chain of all
     stages into the derivative of each, but never a division. The derivative is therefore divided
     by a one that XLA cannot tell from other numbers. Without, gradients take 1.1 (jaxlib 0.10.2) and
-    1.3 times (0.12.0.1) as long in a batch: `python -m benchmarks.thresholds`.
+    1.3 times (0.12.0.1) as long in a batch: `python -m benchmarks.speed.thresholds`.
     """
     del like
     return y

@@ -1,0 +1,1 @@
+"""Comparisons with other programs: state error, violation and time, in one run."""

@@ -1,0 +1,1 @@
+"""What this package costs: compile time, run time, gradients, sizes."""

@@ -1,0 +1,1 @@
+"""What benchmarks share: timing, tables, pictures and problems."""

@@ -1,0 +1,1 @@
+"""Random problems, solved in many ways that must agree."""
