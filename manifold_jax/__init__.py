@@ -36,9 +36,11 @@ from ._mechanics import (
 from ._rosenbrock import MassMatrixTerm as MassMatrixTerm, Rodas3P as Rodas3P, Rodas5P as Rodas5P
 from ._solve.diffeqsolve import diffeqsolve as diffeqsolve
 from ._solver import (
+    AbstractManifoldSolver as AbstractManifoldSolver,
     LocalCoordinates as LocalCoordinates,
     Projected as Projected,
     Stabilized as Stabilized,
+    StepFrame as StepFrame,
 )
 from ._solver.chart import (
     AbstractChart as AbstractChart,

@@ -8,7 +8,7 @@ import pytest
 
 import manifold_jax as mj
 from manifold_jax._solver.step.execution import CarriedDerivative, execution_of, OwnStep, WrittenOut
-from manifold_jax._solver.step.frame import Frame
+from manifold_jax._solver.step.frame import StepFrame
 
 
 CIRCLE = mj.Constraint(lambda t, y, args: y["x"] @ y["x"] - 1.0)
@@ -37,9 +37,9 @@ def two_steps(execution, jump, corrected):
 
     def frame(t1, y0):
         if not corrected:
-            return Frame.of_state(y0, TERM, unchanged)
+            return StepFrame.of_state(y0, TERM, unchanged)
         correct = lambda y: CIRCLE.correct(mj.NewtonProjection(), t1, y, None, fallback=y0)
-        return Frame.of_state(y0, TERM, correct)
+        return StepFrame.of_state(y0, TERM, correct)
 
     def run(speed):
         first = frame(T1, START)
@@ -68,7 +68,7 @@ def test_explicit_steps(solver, jump):
     are compared with nothing to correct."""
     assert isinstance(execution_of(solver, TERM, T0, T1, START, SPEED), WrittenOut)
     check_equal([WrittenOut(solver, False), WrittenOut(solver, True)], jump, True, 1e-15)
-    frame = Frame.of_state(START, TERM, unchanged)
+    frame = StepFrame.of_state(START, TERM, unchanged)
 
     def step(way):
         memory = way.initial_memory(TERM, frame, T0, T1, START, SPEED)

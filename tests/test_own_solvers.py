@@ -2,6 +2,7 @@
 
 import copy
 import pickle
+from typing import ClassVar
 
 import diffrax as dfx
 import jax
@@ -179,3 +180,66 @@ def test_copies_of_a_dense_solution():
     np.testing.assert_array_equal(copy.deepcopy(sol).evaluate(0.3), sol.evaluate(0.3))
     with pytest.raises(TypeError, match=r"`jax.vmap\(sol.evaluate\)\(ts\)`"):
         pickle.dumps(sol)
+
+
+class Relaxed(mj.AbstractManifoldSolver):
+    """A step hook of the user's own: the new state is moved along the step until its length is 1."""
+
+    inner: dfx.AbstractSolver
+    constraint: mj.AbstractConstraint
+    projection: mj.NewtonProjection = mj.NewtonProjection()
+    corrects_output: ClassVar[bool] = True
+
+    def prepare_terms(self, terms):
+        return terms
+
+    def frame(self, terms, t0, t1, y0, args):
+        def correct(y):
+            step = y - y0
+            p = y0 - 2 * (y0 @ step) / (step @ step) * step
+            violation = jnp.abs(p @ p - 1)
+            return p, mj.ProjectionInfo.of_formula(y, p, violation, jnp.all(jnp.isfinite(p)))
+
+        return mj.StepFrame.of_state(y0, terms, correct)
+
+
+def relaxed(rate, **options):
+    options = {"saveat": dfx.SaveAt(ts=jnp.array([0.3, 1.07, 2.0])), **options}
+    start = 1.01 * START  # not on the circle
+    return mj.diffeqsolve(TURN, Relaxed(dfx.Heun(), CIRCLE), 0.0, 2.0, 0.05, start, rate, **options)
+
+
+def test_a_step_hook_of_the_users_own():
+    """The start, the steps, and values between them are on the manifold; the steps are its own."""
+    rate = jnp.asarray(1.3)
+    sol = relaxed(rate, saveat=dfx.SaveAt(steps=True, ts=None), max_steps=64)
+    np.testing.assert_allclose(sol.stats["initial_correction"], 0.01 * 0.8 / 1.808, rtol=1e-2)
+    y, rows = np.asarray(START), np.asarray(sol.ys)[:40]
+    f = lambda y: 1.3 * np.array([-y[1], y[0]])
+    for row in rows:
+        d = 0.025 * (f(y) + f(y + 0.05 * f(y)))
+        y = y - 2 * (y @ d) / (d @ d) * d
+        np.testing.assert_allclose(row, y, rtol=0, atol=1e-13)
+    between = relaxed(rate).ys
+    np.testing.assert_allclose(jnp.sum(between**2, axis=1), 1.0, rtol=0, atol=1e-15)
+
+
+def test_gradients_and_batches_of_a_step_hook_of_the_users_own():
+    end = lambda rate: relaxed(rate).ys[1] @ jnp.array([1.0, 2.0])
+    rate, h = jnp.asarray(1.3), 1e-5
+    difference = (end(rate + h) - end(rate - h)) / (2 * h)
+    np.testing.assert_allclose(jax.jit(jax.grad(end))(rate), difference, rtol=1e-8)
+    np.testing.assert_allclose(jax.jit(jax.jacfwd(end))(rate), difference, rtol=1e-8)
+    rates = jnp.array([0.7, 1.3, 2.0])
+    together = mj.solve_ensemble(
+        TURN,
+        Relaxed(dfx.Heun(), CIRCLE),
+        0.0,
+        2.0,
+        0.05,
+        jnp.tile(START, (3, 1)),
+        rates,
+    )
+    alone = mj.diffeqsolve(TURN, Relaxed(dfx.Heun(), CIRCLE), 0.0, 2.0, 0.05, START, rate)
+    np.testing.assert_allclose(together.ys[1], alone.ys, rtol=0, atol=1e-14)
+    assert together.execution == "in lanes"

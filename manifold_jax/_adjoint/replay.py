@@ -17,7 +17,7 @@ from .._base.types import Args, RealScalarLike, Y
 from .._constraint.projection_info import ProjectionInfo
 from .._solver.step.advance import HookState
 from .._solver.step.execution import execution_of, WrittenOut
-from .._solver.step.frame import Frame
+from .._solver.step.frame import StepFrame
 
 
 class State(NamedTuple):
@@ -107,7 +107,7 @@ class Solve(NamedTuple):
         terms, solver, args, y = self.terms, self.solver, self.args, state.y
         if not self.remembers:
             unchanged = lambda y: (y, ProjectionInfo.of_nothing(y, jnp.asarray(True)))
-            frame = Frame.of_state(y, terms, unchanged)
+            frame = StepFrame.of_state(y, terms, unchanged)
             step = WrittenOut(solver).step(terms, frame, start, end, y, args, None, False)
             return State(step.y1, None), step.dense_info
         solver_state = with_memory(self.solver_state, state.memory)

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 
 from .._base.types import Args, RealScalarLike, Y
-from .constraint import AbstractConstraint
+from .constraint import AbstractConstraint, NoConstraint
 
 
 def check_state(y: Y, name: str = "y0") -> None:
@@ -70,6 +70,8 @@ def has_no_equations(constraint: AbstractConstraint, t: RealScalarLike, y: Y, ar
 def check_constraint(constraint: AbstractConstraint, t: RealScalarLike, y: Y, args: Args) -> int:
     """Refuse, while tracing, constraints of the wrong type or shape; returns `m`."""
     check_constraint_type(constraint)
+    if isinstance(constraint, NoConstraint):
+        return 0
     try:
         out = eqx.filter_eval_shape(constraint, t, y, args)
     except Exception as error:

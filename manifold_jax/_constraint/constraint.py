@@ -1,6 +1,7 @@
 """The manifold `{y : g(t, y, args) = 0}`, and how points are corrected onto it."""
 
 import abc
+from typing import ClassVar
 
 import equinox as eqx
 import jax
@@ -223,3 +224,12 @@ class Invariants(AbstractConstraint):
 
     def __call__(self, t: RealScalarLike, y: Y, args: Args = None) -> Residual:
         return jtu.tree_map(jnp.subtract, self.function(t, y, args), self.values)
+
+
+class NoConstraint(AbstractConstraint):
+    """No equations: the manifold is the whole space."""
+
+    redundant: ClassVar[bool] = False
+
+    def __call__(self, t: RealScalarLike, y: Y, args: Args = None) -> Residual:
+        return jnp.zeros(0)

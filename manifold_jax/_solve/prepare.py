@@ -10,12 +10,12 @@ from jaxtyping import Array
 
 from .._base.types import Args, RealScalarLike, Y
 from .._constraint.checks import check_constraint, check_state
-from .._rosenbrock import MassMatrixTerm
-from .._solver import Stabilized
+from .._rosenbrock import AbstractRosenbrock, MassMatrixTerm
 from .._solver.base import AbstractManifoldSolver, controller_tolerances
 from .._solver.step.advance import HookState
-from .._solver.step.execution import execution_of, WrittenOut
+from .._solver.step.execution import WrittenOut
 from .._solver.terms import DirectedTerm
+from .._solver.unconstrained import Unconstrained
 from .first_step import first_step, FirstStep
 from .mass_matrix import consistent_with_mass
 from .start import Consistent, start_state, StartInfo
@@ -50,16 +50,32 @@ def prepare(
     dtype = time_dtype(t0, t1, dt0, saveat)
     y0 = as_state(y0, dtype)
     t0, t1 = jnp.asarray(t0, dtype), jnp.asarray(t1, dtype)
-    check_constraint(solver.constraint, t0, y0, args)
-    y0, _ = consistent_with_mass(terms, t0, y0, args, consistent, throw)
-    y0, start = start_state(solver.constraint, t0, y0, args, solver.projection, consistent, throw)
+    y0, moved = consistent_with_mass(terms, t0, y0, args, consistent, throw)
+    if isinstance(solver, Unconstrained):
+        start = StartInfo(jnp.zeros((), dtype), jnp.asarray(True))
+    else:
+        check_constraint(solver.constraint, t0, y0, args)
+        y0, start = start_state(
+            solver.constraint, t0, y0, args, solver.projection, consistent, throw
+        )
+    if moved is not None:
+        start = start._replace(correction=jnp.maximum(moved, start.correction))
     solver_state = None
-    if dt0 is None and (first := chosen_first_step(terms, solver, t0, t1, y0, args, controller)):
+    if (
+        dt0 is None
+        and _is_first_step_chosen_here(solver)
+        and (first := chosen_first_step(terms, solver, t0, t1, y0, args, controller))
+    ):
         dt0 = first.size
         solver_state = _solver_state(terms, solver, t0, y0, args, first)
     if not throw:  # what starts with NaN ends before its first step
         y0 = jtu.tree_map(lambda leaf: jnp.where(start.success, leaf, jnp.nan), y0)
     return Ready(t0, t1, dt0, y0, solver_state, start)
+
+
+def _is_first_step_chosen_here(solver: AbstractManifoldSolver) -> bool:
+    """A method of Diffrax without a constraint is left to the choice of Diffrax, for comparisons."""
+    return not isinstance(solver, Unconstrained) or isinstance(solver.inner, AbstractRosenbrock)
 
 
 def time_dtype(t0: Any, t1: Any, dt0: Any, saveat: dfx.SaveAt) -> Any:
@@ -91,8 +107,9 @@ def _solver_state(
 ) -> HookState | None:
     """What `solver.init` would evaluate the vector field for once more, if it is that of `terms`."""
     t1 = t0 + first.size
-    execution = execution_of(solver.inner, terms, t0, t1, y0, args)
-    if isinstance(solver, Stabilized) or not isinstance(execution, WrittenOut):
+    execution = solver.execution(terms, t0, t1, y0, args)
+    rewritten = solver.prepare_terms(terms) is not terms
+    if rewritten or not isinstance(execution, WrittenOut):
         return None
     memory = first.field if execution.remembers_field else None
     return HookState.initial(memory, t0, t1, y0)

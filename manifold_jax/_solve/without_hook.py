@@ -5,16 +5,16 @@ from typing import Any
 
 import diffrax as dfx
 import equinox as eqx
-import jax.numpy as jnp
 import jax.tree_util as jtu
 
 from .._base.compat import is_okay, save_y, update_result
 from .._base.types import Args, RealScalarLike, Y
-from .._rosenbrock import AbstractRosenbrock
+from .._rosenbrock import AbstractRosenbrock, MassMatrixTerm
 from .._solver.step.implicit import with_accurate_stages, with_tolerances_of_stages
-from .mass_matrix import consistent_with_mass, trusting
+from .._solver.unconstrained import Unconstrained
+from .mass_matrix import trusting
 from .outcome import raise_if_failed, result_of_saved
-from .prepare import as_state, chosen_first_step, time_dtype
+from .prepare import prepare
 from .start import Consistent
 
 
@@ -37,15 +37,23 @@ def solve_without_hook(
     solver, moved = with_accurate_stages(solver), None
     solver = with_tolerances_of_stages(solver, options["stepsize_controller"], y0)
     if isinstance(solver, AbstractRosenbrock):
-        dtype = time_dtype(t0, t1, dt0, saveat)
-        y0, t0, t1 = as_state(y0, dtype), jnp.asarray(t0, dtype), jnp.asarray(t1, dtype)
-        y0, moved = consistent_with_mass(terms, t0, y0, args, consistent, throw)
         solver = trusting(solver, consistent)
-        controller = options["stepsize_controller"]
-        if dt0 is None and (
-            first := chosen_first_step(terms, solver, t0, t1, y0, args, controller)
-        ):
-            dt0 = first.size
+        ready = prepare(
+            terms,
+            Unconstrained(solver),
+            t0,
+            t1,
+            dt0,
+            y0,
+            args,
+            saveat,
+            options["stepsize_controller"],
+            consistent,
+            throw,
+        )
+        t0, t1, dt0, y0 = ready.t0, ready.t1, ready.dt0, ready.y0
+        if isinstance(terms, MassMatrixTerm):
+            moved = ready.start.correction
     subs = jtu.tree_leaves(saveat.subs, is_leaf=lambda x: isinstance(x, dfx.SubSaveAt))
     unseen = not any(sub.fn is save_y for sub in subs)
     watched = saveat
@@ -72,6 +80,7 @@ def _warn_of_unknown_hook(solver: dfx.AbstractSolver) -> None:
     warnings.warn(
         f"`solver` is a {name}, a wrapper of your own: `mj.diffeqsolve` does not know its constraint, and corrects "
         "neither `y0` nor values between steps (`SaveAt(ts=)`, events, the dense solution). Write "
-        f"`mj.Projected({name}(...), constraint)`, or call `diffrax.diffeqsolve`.",
+        f"`mj.Projected({name}(...), constraint)`, derive it from `mj.AbstractManifoldSolver`, or call "
+        "`diffrax.diffeqsolve`.",
         stacklevel=2,
     )

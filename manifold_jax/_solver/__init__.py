@@ -1,3 +1,5 @@
+from .base import AbstractManifoldSolver as AbstractManifoldSolver
 from .local_coordinates import LocalCoordinates as LocalCoordinates
 from .projected import Projected as Projected
 from .stabilized import Stabilized as Stabilized
+from .step.frame import StepFrame as StepFrame

@@ -1,18 +1,25 @@
-"""What every step hook shares: forwarding to the solver it is wrapped around."""
+"""What every step hook shares: one `init` and one `step` around those of the wrapped solver."""
 
+import abc
 import dataclasses
+from collections.abc import Callable
 from typing import Any
 
 import diffrax as dfx
 import equinox as eqx
+from diffrax import RESULTS
 
-from .._base.compat import is_sde, undirected
+from .._base.compat import is_sde, undirected, update_result
 from .._base.types import Args, RealScalarLike, Y
-from .._constraint.checks import check_constraint_type
-from .._constraint.constraint import AbstractConstraint
+from .._constraint.checks import check_constraint, check_constraint_type
+from .._constraint.constraint import AbstractConstraint, NoConstraint
 from .._constraint.projection_info import ProjectionInfo
 from .._constraint.settings import NewtonProjection
 from .._rosenbrock import AbstractRosenbrock, MassMatrixTerm
+from .interpolation import CorrectedInterpolationFactory
+from .step.advance import conclude, HookState
+from .step.execution import AbstractExecution, execution_of
+from .step.frame import StepFrame
 
 
 # One-step methods that keep no past values of y. Others (leapfrog, reversible) carry a
@@ -29,25 +36,99 @@ _SUPPORTED = (
 
 
 class AbstractManifoldSolver(dfx.AbstractWrappedSolver):
-    """A Diffrax solver wrapped around another, `inner`, that keeps to a manifold.
+    """A Diffrax solver wrapped around another, `inner`, whose steps are kept on a manifold.
 
-    Diffrax looks at the type and at some attributes of the solver it is given. It sends
-    type checks through `.solver`, one level only, so `solver` is the innermost solver;
-    everything else is forwarded here, in one place. Implementations provide `init`,
-    `step` and `interpolation_cls`.
+    [`Projected`][], [`Stabilized`][] and [`LocalCoordinates`][] are its implementations. Write one of your own
+    for another correction of steps: [`mj.diffeqsolve`][] then makes `y0` consistent and corrects
+    saved values, events and the dense solution for it, too, which it cannot do for an unknown
+    wrapper. An implementation is a dataclass with these three fields, a class variable and two methods:
+
+    - `inner`: the wrapped solver, a one-step method of Diffrax or a Rosenbrock method.
+    - `constraint`: the manifold, an [`AbstractConstraint`][].
+    - `projection`: how corrections are made, [`NewtonProjection`][].
+    - `corrects_output`: whether steps end on the manifold, and values between steps are to be
+        corrected onto it.
+    - [`prepare_terms`][manifold_jax.AbstractManifoldSolver.prepare_terms] and
+        [`frame`][manifold_jax.AbstractManifoldSolver.frame].
+
+    The other fields are set by [`mj.diffeqsolve`][] and need no attention.
+
+    Source: the common part of sections 3.2 to 3.4 of Sudarsan & Keerthi (1998).
     """
 
+    # Diffrax looks at the type and at some attributes of the solver it is given. It sends type checks
+    # through `.solver`, one level only, so `solver` is the innermost solver; everything else is
+    # forwarded here, in one place.
     inner: eqx.AbstractVar[dfx.AbstractSolver]
     constraint: eqx.AbstractVar[AbstractConstraint]
-    projection: eqx.AbstractVar[NewtonProjection]  # also corrects what is handed out
-    corrects_output: eqx.AbstractVar[bool]  # whether what is handed out is corrected
+    projection: eqx.AbstractVar[NewtonProjection]
+    corrects_output: eqx.AbstractVar[bool]
     # Whether interpolants are bent to end at the corrected state. Not where every interpolated value
     # is corrected afterwards, which makes them continuous by itself: the same correction of the same
     # point. Bending costs more than interpolating.
-    bends_interpolant: eqx.AbstractVar[bool]
+    bends_interpolant: bool = eqx.field(default=True, kw_only=True)
     # Whether the error estimate of a step is at least the size of its correction, which is a lower
     # bound of the local error (Sudarsan & Keerthi 1998, 3.4).
-    bounds_error: eqx.AbstractVar[bool]
+    bounds_error: bool = eqx.field(default=False, kw_only=True)
+    # A state near that of the coordinates in which steps are made, where those are not the state.
+    state_of_coordinates: Callable[[Y, Y], Y] | None = eqx.field(
+        default=None, kw_only=True, static=True
+    )
+
+    @abc.abstractmethod
+    def prepare_terms(self, terms: Any) -> Any:
+        """Refuse terms that this hook cannot keep on the manifold; return those whose solution the
+        steps approximate: `terms` themselves, or with another vector field."""
+
+    @abc.abstractmethod
+    def frame(
+        self, terms: Any, t0: RealScalarLike, t1: RealScalarLike, y0: Y, args: Args
+    ) -> StepFrame:
+        """The coordinates in which the step from `t0` to `t1` is made, and how its end is corrected.
+        Times are those of Diffrax, which are negated backwards: `diffrax` calls terms with
+        `t * direction`. `mj.StepFrame.of_state(y0, terms, correct)` where the state is its own
+        coordinates; `correct(y)` returns the new state and a [`ProjectionInfo`][]."""
+
+    def init(self, terms, t0: RealScalarLike, t1: RealScalarLike, y0: Y, args: Args) -> HookState:
+        terms = self.prepare_terms(terms)
+        check_constraint(self.constraint, t0, y0, args)
+        frame = self.frame(terms, t0, t1, y0, args)
+        execution = self.execution(terms, t0, t1, y0, args)
+        memory = execution.initial_memory(terms, frame, t0, t1, y0, args)
+        return HookState.initial(memory, t0, t1, y0)
+
+    def step(
+        self,
+        terms,
+        t0: RealScalarLike,
+        t1: RealScalarLike,
+        y0: Y,
+        args: Args,
+        solver_state: HookState,
+        made_jump: Any,
+    ) -> tuple[Y, Y | None, dict[str, Any], HookState, RESULTS]:
+        terms = self.prepare_terms(terms)
+        frame = self.frame(terms, t0, t1, y0, args)
+        execution = self.execution(terms, t0, t1, y0, args)
+        step = execution.step(terms, frame, t0, t1, y0, args, solver_state.memory, made_jump)
+        if frame.error_of_state is not None and step.error is not None:
+            step = step._replace(error=frame.error_of_state(step.w1, step.y1, step.error))
+        if frame.verdict is not None:
+            step = step._replace(result=update_result(step.result, frame.verdict(step.y1)))
+        rejects = not isinstance(self.constraint, NoConstraint)
+        return conclude(step, t0, t1, solver_state, self.bounds_error, rejects)
+
+    def execution(
+        self, terms: Any, t0: RealScalarLike, t1: RealScalarLike, y0: Y, args: Args
+    ) -> AbstractExecution:
+        """How steps of `inner` are executed, for terms that are prepared."""
+        return execution_of(self.inner, terms, t0, t1, y0, args)
+
+    @property
+    def interpolation_cls(self):  # pyright: ignore
+        bend = self.bends_interpolant and self.corrects_output
+        inner = self.inner.interpolation_cls
+        return CorrectedInterpolationFactory(inner, bend, self.state_of_coordinates)
 
     def within(
         self, controller: dfx.AbstractStepSizeController, bends_interpolant: bool
@@ -107,7 +188,7 @@ class AbstractManifoldSolver(dfx.AbstractWrappedSolver):
         return self.inner.error_order(terms)
 
     def func(self, terms, t0: RealScalarLike, y0: Y, args: Args) -> Any:
-        return self.inner.func(terms, t0, y0, args)
+        return self.inner.func(self.prepare_terms(terms), t0, y0, args)
 
 
 def controller_tolerances(controller: Any) -> dfx.PIDController | None:

@@ -7,20 +7,15 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from diffrax import RESULTS
 
 from .._base.compat import is_sde, time_direction
 from .._base.types import Args, BoolScalar, RealScalarLike, Y
-from .._constraint.checks import check_constraint
 from .._constraint.constraint import AbstractConstraint
 from .._constraint.projection_info import ProjectionInfo
 from .._constraint.settings import NewtonProjection
 from .base import AbstractManifoldSolver, check_hook_arguments, check_no_mass_matrix, check_noise
 from .chart import AbstractChart, AbstractCoordinates, check_state_like, TangentSpaceChart
-from .interpolation import CorrectedInterpolationFactory
-from .step.advance import conclude, HookState
-from .step.execution import execution_of, Step
-from .step.frame import Frame
+from .step.frame import StepFrame
 from .step.implicit import with_accurate_stages
 from .terms import rewrite_terms, RewrittenTerm
 
@@ -55,8 +50,6 @@ class LocalCoordinates(AbstractManifoldSolver):
     constraint: AbstractConstraint
     projection: NewtonProjection
     chart: AbstractChart
-    bends_interpolant: bool
-    bounds_error: bool
     corrects_output: ClassVar[bool] = True
 
     def __init__(
@@ -81,14 +74,9 @@ class LocalCoordinates(AbstractManifoldSolver):
         self.chart = chart
         self.bends_interpolant = True
         self.bounds_error = False
+        self.state_of_coordinates = chart.state
 
-    @property
-    def interpolation_cls(self):  # pyright: ignore
-        return CorrectedInterpolationFactory(
-            self.inner.interpolation_cls, self.bends_interpolant, self.chart.state
-        )
-
-    def init(self, terms, t0: RealScalarLike, t1: RealScalarLike, y0: Y, args: Args) -> HookState:
+    def prepare_terms(self, terms: Any) -> Any:
         check_noise(self.solver, terms)
         check_no_mass_matrix(terms, "LocalCoordinates")
         if self.chart.state is not None and is_sde(terms):
@@ -96,38 +84,16 @@ class LocalCoordinates(AbstractManifoldSolver):
                 f"`terms` has noise, which coordinates of `chart={type(self.chart).__name__}` are not for. Use "
                 "`mj.Projected(solver, constraint)`."
             )
-        check_constraint(self.constraint, t0, y0, args)
-        execution = execution_of(self.inner, terms, t0, t1, y0, args)
-        frame = self._coordinates(terms, t0, y0, args).frame(terms, t1, args, self.chart.state)
-        memory = execution.initial_memory(terms, frame, t0, t1, y0, args)
-        return HookState.initial(memory, t0, t1, y0)
+        return terms
 
-    def step(
-        self,
-        terms,
-        t0: RealScalarLike,
-        t1: RealScalarLike,
-        y0: Y,
-        args: Args,
-        solver_state: HookState,
-        made_jump: Any,
-    ) -> tuple[Y, Y | None, dict[str, Any], HookState, RESULTS]:
-        execution = execution_of(self.inner, terms, t0, t1, y0, args)
-        directed = self._coordinates(terms, t0, y0, args)
-        frame = directed.frame(terms, t1, args, self.chart.state)
-        step = execution.step(terms, frame, t0, t1, y0, args, solver_state.memory, made_jump)
-        if step.error is not None:
-            step = step._replace(error=directed.error_of_state(t1, step, args))
-        return conclude(step, t0, t1, solver_state, self.bounds_error)
-
-    def _coordinates(
-        self, terms: Any, t0: RealScalarLike, y0: Y, args: Args
-    ) -> "_DirectedCoordinates":
+    def frame(
+        self, terms: Any, t0: RealScalarLike, t1: RealScalarLike, y0: Y, args: Args
+    ) -> StepFrame:
         direction = time_direction(terms)
         of = self.chart.at(self.constraint, self.projection, t0 * direction, y0, args)
         if self.chart.state is None:
             check_state_like(self.chart, of.origin, y0)
-        return _DirectedCoordinates(of, y0, direction)
+        return _DirectedCoordinates(of, y0, direction).frame(terms, t1, args, self.chart.state)
 
 
 class _DirectedCoordinates(eqx.Module):
@@ -137,10 +103,11 @@ class _DirectedCoordinates(eqx.Module):
     centre: Y
     direction: RealScalarLike
 
-    def frame(self, terms: Any, t1: RealScalarLike, args: Args, state: Any) -> Frame:
+    def frame(self, terms: Any, t1: RealScalarLike, args: Args, state: Any) -> StepFrame:
         stage_terms = rewrite_terms(terms, lambda term: RewrittenTerm(term, self.field))
         correct = lambda w: self.lift(t1, w, args)
-        return Frame(self.of.origin, stage_terms, correct, self.pull_back, state)
+        error = lambda w1, y1, e: self.of.push_forward(t1 * self.direction, w1, y1, args, e)
+        return StepFrame(self.of.origin, stage_terms, correct, self.pull_back, state, error)
 
     def lift(self, t: RealScalarLike, w: Y, args: Args) -> tuple[Y, ProjectionInfo]:
         return self.of.lift(t * self.direction, w, args)
@@ -157,9 +124,6 @@ class _DirectedCoordinates(eqx.Module):
 
     def pull_back(self, t: RealScalarLike, w: Y, y: Y, vector: Y) -> Y:
         return self.of.pull_back(t * self.direction, w, y, vector)
-
-    def error_of_state(self, t1: RealScalarLike, step: Step, args: Args) -> Y:
-        return self.of.push_forward(t1 * self.direction, step.w1, step.y1, args, step.error)
 
 
 def nan_unless(success: BoolScalar, tree: Any) -> Any:

@@ -3,18 +3,13 @@
 from typing import Any, ClassVar
 
 import diffrax as dfx
-from diffrax import RESULTS
 
 from .._base.compat import time_direction
 from .._base.types import Args, RealScalarLike, Y
-from .._constraint.checks import check_constraint
 from .._constraint.constraint import AbstractConstraint
 from .._constraint.settings import NewtonProjection
 from .base import AbstractManifoldSolver, check_hook_arguments, check_noise
-from .interpolation import CorrectedInterpolationFactory
-from .step.advance import conclude, HookState
-from .step.execution import execution_of
-from .step.frame import Frame
+from .step.frame import StepFrame
 from .step.implicit import with_accurate_stages
 
 
@@ -59,8 +54,6 @@ class Projected(AbstractManifoldSolver):
     inner: dfx.AbstractSolver
     constraint: AbstractConstraint
     projection: NewtonProjection
-    bends_interpolant: bool
-    bounds_error: bool
     corrects_output: ClassVar[bool] = True
 
     def __init__(
@@ -76,34 +69,14 @@ class Projected(AbstractManifoldSolver):
         self.projection = NewtonProjection() if projection is None else projection
         self.bends_interpolant = True
         self.bounds_error = False
+        self.state_of_coordinates = None
 
-    @property
-    def interpolation_cls(self):  # pyright: ignore
-        return CorrectedInterpolationFactory(self.inner.interpolation_cls, self.bends_interpolant)
-
-    def init(self, terms, t0: RealScalarLike, t1: RealScalarLike, y0: Y, args: Args) -> HookState:
+    def prepare_terms(self, terms: Any) -> Any:
         check_noise(self.solver, terms)
-        check_constraint(self.constraint, t0, y0, args)
-        execution = execution_of(self.inner, terms, t0, t1, y0, args)
-        frame = self._frame(terms, t1, y0, args)
-        memory = execution.initial_memory(terms, frame, t0, t1, y0, args)
-        return HookState.initial(memory, t0, t1, y0)
+        return terms
 
-    def step(
-        self,
-        terms,
-        t0: RealScalarLike,
-        t1: RealScalarLike,
-        y0: Y,
-        args: Args,
-        solver_state: HookState,
-        made_jump: Any,
-    ) -> tuple[Y, Y | None, dict[str, Any], HookState, RESULTS]:
-        execution = execution_of(self.inner, terms, t0, t1, y0, args)
-        frame = self._frame(terms, t1, y0, args)
-        step = execution.step(terms, frame, t0, t1, y0, args, solver_state.memory, made_jump)
-        return conclude(step, t0, t1, solver_state, self.bounds_error)
-
-    def _frame(self, terms: Any, t1: RealScalarLike, y0: Y, args: Args) -> Frame:
+    def frame(
+        self, terms: Any, t0: RealScalarLike, t1: RealScalarLike, y0: Y, args: Args
+    ) -> StepFrame:
         time = t1 * time_direction(terms)
-        return Frame.of_state(y0, terms, lambda y: self.correct(time, y, args, fallback=y0))
+        return StepFrame.of_state(y0, terms, lambda y: self.correct(time, y, args, fallback=y0))

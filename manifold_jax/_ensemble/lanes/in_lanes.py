@@ -12,6 +12,7 @@ from ..._base.compat import nonlinear_failure, update_result
 from ..._base.types import BoolScalar
 from ..._jaxpr.lane_arrays import NotScalarError
 from ..._solve.outcome import result_of_saved
+from ..._solver.unconstrained import Unconstrained
 from .forward import tangents_in_lanes
 from .mapped import gradient_of_mapped, tangents_of_mapped
 from .parts import in_steps, Inputs, Parts, times_are_differentiated
@@ -19,7 +20,6 @@ from .reverse import Ends, WayBack
 from .rows import saved_rows
 from .schedule import Run, Schedule
 from .solution import EnsembleSolution
-from .unconstrained import Unconstrained
 
 
 # Numbers that all trajectories have in common, each of which has a sum of its own in every lane.

@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 
 from ..._solve.diffeqsolve import diffeqsolve
+from ..._solver.unconstrained import Unconstrained
 from .parts import Inputs
 from .solution import EnsembleSolution
-from .unconstrained import Unconstrained
 
 
 def solve_mapped(inputs: Inputs, lanes: int) -> EnsembleSolution:

@@ -19,7 +19,6 @@ from ..._solve.prepare import prepare, Ready
 from ..._solve.start import Consistent
 from ..._solve.times import is_time_missing
 from ..._solver.step.advance import HookState, StepStatistics
-from .unconstrained import Unconstrained
 
 
 class Trajectory(NamedTuple):
@@ -111,10 +110,6 @@ class Equations(eqx.Module):
 
     def _ready(self, given: Given) -> Ready:
         solver, (t0, t1, y0, args) = self.solver, given
-        if isinstance(solver, Unconstrained):
-            return solver.ready(
-                self.terms, t0, t1, self.dt0, y0, args, self.saveat, self.controller
-            )
         return prepare(
             self.terms,
             solver,

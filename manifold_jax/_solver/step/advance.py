@@ -71,13 +71,19 @@ class HookState(eqx.Module):
 
 
 def conclude(
-    step: Step, t0: RealScalarLike, t1: RealScalarLike, state: HookState, bounds_error: bool
+    step: Step,
+    t0: RealScalarLike,
+    t1: RealScalarLike,
+    state: HookState,
+    bounds_error: bool,
+    rejects: bool = True,
 ) -> tuple[Y, Y | None, dict[str, Any], HookState, RESULTS]:
     """What a solver's `step` returns. A step that could not be corrected is to be rejected; with
-    `bounds_error` the error estimate is at least the size of the correction."""
+    `bounds_error` the error estimate is at least the size of the correction. Without a constraint
+    nothing is rejected here that the method keeps."""
     corrected = RESULTS.where(step.info.success, RESULTS.successful, nonlinear_failure())
     result, error = update_result(step.result, corrected), step.error
-    if error is not None:
+    if error is not None and rejects:
         repeatable = is_repeatable(t0, t1, state.first_step)
         if bounds_error:
             error = _at_least(error, step.raw, step.y1, repeatable)

@@ -16,7 +16,7 @@ from diffrax import RESULTS
 from ..._base.types import Args, RealScalarLike, Y
 from ..._constraint.projection_info import ProjectionInfo
 from .explicit import explicit_step, is_first_same_as_last, is_unrollable, refreshed
-from .frame import Frame
+from .frame import StepFrame
 from .implicit import carries_derivative, step_with_derivative
 
 
@@ -42,7 +42,13 @@ class AbstractExecution(eqx.Module):
 
     @abc.abstractmethod
     def initial_memory(
-        self, terms: Any, frame: Frame, t0: RealScalarLike, t1: RealScalarLike, y0: Y, args: Args
+        self,
+        terms: Any,
+        frame: StepFrame,
+        t0: RealScalarLike,
+        t1: RealScalarLike,
+        y0: Y,
+        args: Args,
     ) -> Any:
         """Before the first step."""
 
@@ -50,7 +56,7 @@ class AbstractExecution(eqx.Module):
     def step(
         self,
         terms: Any,
-        frame: Frame,
+        frame: StepFrame,
         t0: RealScalarLike,
         t1: RealScalarLike,
         y0: Y,
@@ -145,12 +151,14 @@ def execution_of(
     return OwnStep(solver)
 
 
-def _in_coordinates(frame: Frame, terms: Any, y0: Y) -> tuple[Any, Y]:
+def _in_coordinates(frame: StepFrame, terms: Any, y0: Y) -> tuple[Any, Y]:
     """The differential equation of what is remembered of a step, and where that begins."""
     return (terms, y0) if frame.state is None else (frame.terms, frame.origin)
 
 
-def _in_state(frame: Frame, y0: Y, w1: Y, dense_info: dict[str, Any]) -> tuple[Y, dict[str, Any]]:
+def _in_state(
+    frame: StepFrame, y0: Y, w1: Y, dense_info: dict[str, Any]
+) -> tuple[Y, dict[str, Any]]:
     """The state that the solver's own interpolation leads to, and the data of it."""
     if frame.state is None:
         return w1, dense_info

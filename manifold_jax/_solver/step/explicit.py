@@ -20,7 +20,7 @@ from jaxtyping import Array
 from ..._base.types import Args, RealScalarLike, Y
 from ..._constraint.projection_info import ProjectionInfo
 from ..._jaxpr.trace import num_equations
-from .frame import Frame
+from .frame import StepFrame
 
 
 # Equations of the vector field times stages. With up to 210 (rigid body) a loop over the stages takes
@@ -66,7 +66,7 @@ class ExplicitStep(NamedTuple):
 def explicit_step(
     tableau: dfx.ButcherTableau,
     terms: AbstractTerm,
-    frame: Frame,
+    frame: StepFrame,
     t0: RealScalarLike,
     t1: RealScalarLike,
     y0: Y,

@@ -3,11 +3,13 @@
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+from diffrax import RESULTS
+
 from ..._base.types import RealScalarLike, Y
 from ..._constraint.projection_info import ProjectionInfo
 
 
-class Frame(NamedTuple):
+class StepFrame(NamedTuple):
     """The coordinates `w` that one step of a solver advances.
 
     - `origin`: those of the state `y0` at which the step begins.
@@ -16,6 +18,9 @@ class Frame(NamedTuple):
     - `pull_back`: `(t, w, y, vector)`, the velocity of coordinates of one of the state.
     - `state`: for dense output, `(y0, w)`: a state near that of the coordinates; `None` if it is
         `w` itself.
+    - `error_of_state`: `(w1, y1, error)`, the error estimate of the state from that of the
+        coordinates; `None` if they are the same.
+    - `verdict`: the result of a step that ends at a state, where `correct` does not look at it.
     """
 
     origin: Y
@@ -23,8 +28,15 @@ class Frame(NamedTuple):
     correct: Callable[[Y], tuple[Y, ProjectionInfo]]
     pull_back: Callable[[RealScalarLike, Y, Y, Y], Y]
     state: Callable[[Y, Y], Y] | None = None
+    error_of_state: Callable[[Y, Y, Y], Y] | None = None
+    verdict: Callable[[Y], RESULTS] | None = None
 
     @staticmethod
-    def of_state(y0: Y, terms: Any, correct: Callable[[Y], tuple[Y, ProjectionInfo]]) -> "Frame":
+    def of_state(
+        y0: Y,
+        terms: Any,
+        correct: Callable[[Y], tuple[Y, ProjectionInfo]],
+        verdict: Callable[[Y], RESULTS] | None = None,
+    ) -> "StepFrame":
         """The state as its own coordinates."""
-        return Frame(y0, terms, correct, lambda t, w, y, vector: vector)
+        return StepFrame(y0, terms, correct, lambda t, w, y, vector: vector, verdict=verdict)

@@ -12,7 +12,7 @@ import optimistix as optx
 from ..._base.compat import use_stepsize_tol
 from ..._base.types import Args, BoolScalar, FloatScalar, RealScalarLike, Y
 from .explicit import refreshed
-from .frame import Frame
+from .frame import StepFrame
 
 
 # The most iterations, one less than Diffrax allows. A stage that is still not at round-off is that
@@ -137,7 +137,7 @@ def _tableaus(solver: Any) -> tuple[dfx.ButcherTableau, ...]:
 def step_with_derivative(
     solver: dfx.AbstractSolver,
     terms: Any,
-    frame: Frame,
+    frame: StepFrame,
     t0: RealScalarLike,
     t1: RealScalarLike,
     y0: Y,
