@@ -14,6 +14,7 @@ from ._constraint.constraint import (
     Constraint as Constraint,
     Invariants as Invariants,
 )
+from ._constraint.correction import ConstraintNormals as ConstraintNormals
 from ._constraint.project import consistent_state as consistent_state, project as project
 from ._constraint.projection_info import ProjectionInfo as ProjectionInfo
 from ._constraint.settings import NewtonProjection as NewtonProjection

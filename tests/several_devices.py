@@ -32,10 +32,10 @@ def devices():
 
 
 def solve(mesh, y=STARTS, rates=RATES, t1=1.0, dt0=None, solver=CIRCLE, **options):
-    args, in_axes = (rates, SHIFT), (0 if rates.ndim else None, None)
+    args, args_axes = (rates, SHIFT), (0 if rates.ndim else None, None)
     options = dict(stepsize_controller=PID, lanes=2) | options
     return mj.solve_ensemble(
-        TURN, solver, 0.0, t1, dt0, y, args, in_axes=in_axes, mesh=mesh, **options
+        TURN, solver, 0.0, t1, dt0, y, args, args_axes=args_axes, mesh=mesh, **options
     )
 
 
@@ -69,7 +69,7 @@ def test_gradient_with_one_sum(devices):
             None,
             starts,
             (rate, shift),
-            in_axes=None,
+            args_axes=None,
             stepsize_controller=PID,
             lanes=2,
             mesh=mesh,

@@ -333,7 +333,7 @@ def test_hessian_vector_product(hook, solver):
 
 
 def test_stochastic():
-    """Brownian motion is a function of time, and the same on the way back."""
+    """Brownian motion is a function of time, and the same in the reverse sweep."""
     problem = mj.problems.sphere_flow()
     noise = dfx.VirtualBrownianTree(0.0, 1.0, 1e-3, (), jax.random.key(0))
 

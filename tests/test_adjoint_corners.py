@@ -95,7 +95,7 @@ def test_what_solvers_remember_is_part_of_the_state(solver):
 
 
 def test_a_time_dependent_constraint_with_times():
-    """The correction of what is saved depends on the times that are handed out."""
+    """The correction of what is saved depends on the times that are returned."""
     growing = mj.Constraint(lambda t, y, rate: y @ y - (1 + t) ** rate)
     field = dfx.ODETerm(lambda t, y, rate: rate / 2 / (1 + t) * y + jnp.stack([-y[1], y[0]]))
 

@@ -108,7 +108,10 @@ four = lambda t, q, v, args: q
         (lambda: mj.Constraint(two), r"`function`.*`g\(t, y, args\)`.*`\(t, y\)`"),
         (lambda: mj.Invariants(two, y0=START), r"`function`.*`I\(t, y, args\)`"),
         (lambda: mj.tangent_field(two, CIRCLE), r"`function`.*`f\(t, y, args\)`"),
-        (lambda: mj.MechanicalSystem(1.0, four, four), r"`constraint`.*`phi\(t, q, args\)`"),
+        (
+            lambda: mj.MechanicalSystem(1.0, four, four),
+            r"`position_constraint`.*`phi\(t, q, args\)`",
+        ),
         (lambda: mj.MechanicalSystem(1.0, three, three), r"`force`.*`Q\(t, q, v, args\)`"),
         (lambda: mj.MechanicalSystem(three, three, four), r"`mass_matrix`.*`M\(q, args\)`"),
         (
@@ -220,7 +223,7 @@ def test_parameters_into_which_jax_cannot_look():
     for call in (
         lambda: solve(args={"motor": wrong}),
         lambda: mj.solve_ensemble(
-            TURN, dfx.Heun(), 0.0, 1.0, 0.1, START[None], wrong, in_axes=None
+            TURN, dfx.Heun(), 0.0, 1.0, 0.1, START[None], wrong, args_axes=None
         ),
         lambda: mj.project(CIRCLE, 0.0, START, wrong),
     ):
@@ -272,3 +275,21 @@ def test_a_group_for_several_arrays():
     solver = mj.LocalCoordinates(dfx.Heun(), constraint, chart=mj.LieGroupChart(mj.SO3()))
     with pytest.raises(ValueError, match="`groups` of `mj.LieGroupChart` must be like the state"):
         solve(terms=field, solver=solver, y0=(jnp.eye(3), START))
+
+
+@pytest.mark.parametrize(
+    ("call", "new"),
+    [
+        (lambda: mj.MechanicalSystem(1.0, constraint=None, force=None), "position_constraint"),
+        (lambda: mj.MechanicalSystem(1.0, None, None, further=abs), "auxiliary"),
+        (lambda: mj.MechanicalSystem.from_lagrangian(abs, constraint=None), "position_constraint"),
+        (
+            lambda: mj.solve_ensemble(TURN, dfx.Heun(), 0, 1, 0.1, START[None], in_axes=0),
+            "args_axes",
+        ),
+        (lambda: mj.stream_ensemble(abs, 2, out="folder"), "path"),
+    ],
+)
+def test_renamed_arguments_say_their_new_name(call, new):
+    with pytest.raises(TypeError, match=f"has been renamed: write `{new}="):
+        call()

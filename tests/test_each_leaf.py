@@ -63,7 +63,7 @@ def difference(f, x, along, h):
 def check_problem(problem):
     field = lambda t, y, args: total(problem.terms.vf(t, y, args))
     if problem.system is not None and problem.system.redundant:
-        # Beside the manifold equations that depend on each other contradict each other.
+        # Off the manifold equations that depend on each other contradict each other.
         return check(lambda args: field(0.1, problem.y0, args), problem.args)
     aside = lambda x: x + 0.01 * jnp.cos(jnp.arange(x.size)).reshape(x.shape)
     return check(field, jnp.asarray(0.1), jax.tree.map(aside, problem.y0), problem.args)

@@ -65,7 +65,9 @@ def test_each_is_what_it_is_alone(name):
     saveat = dfx.SaveAt(t0=True, ts=jnp.array([0.25, 0.5]), t1=True)
     t1s = jnp.linspace(0.5, 2.0, SIZE)
     options = dict(saveat=saveat, stepsize_controller=PID)
-    sol = mj.solve_ensemble(TURN, hook, 0.25, t1s, None, STARTS, RATES, lanes=LANES, **options)
+    sol = mj.solve_ensemble(
+        TURN, hook, 0.25, t1s, None, STARTS, RATES, lanes=LANES, **options, args_axes=0
+    )
     single = jax.jit(jax.vmap(lambda t1, y, a: alone(hook, 0.25, t1, None, y, a, **options)))
     assert_equal(sol, single(t1s, STARTS, RATES))
     if name not in ("stabilized", "plain", "stiff"):
@@ -80,7 +82,7 @@ def test_backwards_with_constant_steps_and_functions():
     saveat = dfx.SaveAt(ts=jnp.array([0.4, 0.1]), fn=lambda t, y, args: t * y[0] + args)
     run = lambda f, y, a: f(hook, 1.0, 0.0, -0.125, y, a, saveat=saveat)
     ensemble = lambda hook, t0, *args, **options: mj.solve_ensemble(
-        TURN, hook, t0, *args, in_axes=None, lanes=LANES, **options
+        TURN, hook, t0, *args, args_axes=None, lanes=LANES, **options
     )
     sol = run(ensemble, STARTS, jnp.asarray(2.0))
     assert_equal(sol, jax.vmap(lambda y: run(alone, y, jnp.asarray(2.0)))(STARTS))
@@ -92,7 +94,17 @@ def test_a_failure_leaves_the_others_as_they_are():
     hook = HOOKS["projected"]
     solve = jax.jit(
         lambda y, a: mj.solve_ensemble(
-            TURN, hook, 0.0, 2.0, None, y, a, lanes=LANES, stepsize_controller=PID, max_steps=2000
+            TURN,
+            hook,
+            0.0,
+            2.0,
+            None,
+            y,
+            a,
+            lanes=LANES,
+            stepsize_controller=PID,
+            max_steps=2000,
+            args_axes=0,
         )
     )
     good = solve(STARTS, RATES)
@@ -119,6 +131,7 @@ def test_a_failure_leaves_the_others_as_they_are():
             stepsize_controller=PID,
             max_steps=9,
             throw=True,
+            args_axes=0,
         )
 
 
@@ -137,7 +150,7 @@ def test_one_of_a_thousand(bad, thousand):
 
 @pytest.fixture(scope="module")
 def thousand():
-    options = dict(in_axes=None, stepsize_controller=PID)
+    options = dict(args_axes=None, stepsize_controller=PID)
     hook, rate = HOOKS["projected"], jnp.asarray(2.0)
     return jax.jit(lambda y: mj.solve_ensemble(TURN, hook, 0.0, 1.0, None, y, rate, **options))
 
@@ -152,7 +165,9 @@ def test_a_saved_value_that_cannot_be_corrected():
     hook = mj.Projected(dfx.Bosh3(), mj.Constraint(g))
     options = dict(saveat=dfx.SaveAt(ts=jnp.array([0.2, 0.3, 0.4])))
     rates = RATES[::-1]  # those that fail come first
-    sol = mj.solve_ensemble(TURN, hook, 0.0, 0.5, 0.125, STARTS, rates, lanes=LANES, **options)
+    sol = mj.solve_ensemble(
+        TURN, hook, 0.0, 0.5, 0.125, STARTS, rates, lanes=LANES, **options, args_axes=0
+    )
     single = jax.jit(jax.vmap(lambda y, a: alone(hook, 0.0, 0.5, 0.125, y, a, **options)))
     assert_equal(sol, single(STARTS, rates))
     np.testing.assert_array_equal(sol.failed, rates > 2)
@@ -164,7 +179,9 @@ def test_a_saved_value_that_cannot_be_corrected():
 def test_undefined_starts_leave_the_others_untouched():
     def solve(y):
         options = dict(lanes=LANES, stepsize_controller=PID)
-        return mj.solve_ensemble(TURN, HOOKS["projected"], 0.0, 0.5, None, y, RATES, **options)
+        return mj.solve_ensemble(
+            TURN, HOOKS["projected"], 0.0, 0.5, None, y, RATES, **options, args_axes=0
+        )
 
     all, some = solve(STARTS), solve(STARTS.at[2, 0].set(jnp.nan).at[5].set(0.0))
     assert [number for number, _ in some.failures()] == [2, 5]
@@ -194,7 +211,7 @@ def gradients(hook, saveat, t1s, loss):
             None,
             y,
             (common, own),
-            in_axes=(None, 0),
+            args_axes=(None, 0),
             lanes=LANES,
             adjoint=adjoint,
             **options,
@@ -264,6 +281,7 @@ def test_gradient_beside_values_that_have_none():
         lanes=LANES,
         adjoint=adjoint,
         saveat=saveat,
+        args_axes=0,
     )
     loss = lambda rates, adjoint: jnp.sum(jnp.sin(solve(rates, adjoint).ys["x"]))
     reverse = jax.grad(loss)(RATES, mj.StepReplayAdjoint())
@@ -293,6 +311,7 @@ def test_gradient_beside_a_failure():
             STARTS[:size],
             rates[:size],
             lanes=LANES,
+            args_axes=0,
         )
         return jnp.sum(jnp.where(sol.failed[:, None, None], 0.0, sol.ys) ** 3)
 
@@ -310,7 +329,9 @@ def test_gradient_beside_a_failure():
 )
 def test_implicit_solvers_take_the_ordinary_way(solver):
     options = dict(stepsize_controller=PID)
-    sol = mj.solve_ensemble(TURN, solver, 0.0, 0.5, 0.1, STARTS, RATES, lanes=LANES, **options)
+    sol = mj.solve_ensemble(
+        TURN, solver, 0.0, 0.5, 0.1, STARTS, RATES, lanes=LANES, **options, args_axes=0
+    )
     assert sol.execution.startswith("mapped over")
     assert "Kvaerno3 is not an explicit" in sol.execution
     single = jax.jit(jax.vmap(lambda y, a: alone(solver, 0.0, 0.5, 0.1, y, a, **options)))
@@ -327,7 +348,9 @@ def test_stiff_systems_fail_alone():
     rates = jnp.array([0.2, 1.0, 2.0, jnp.nan])
     starts, options = jnp.array([[0.0, 1.0]] * 4), dict(stepsize_controller=PID, max_steps=500)
     terms, solver = dfx.ODETerm(field), mj.Rodas3P()
-    sol = mj.solve_ensemble(terms, solver, 0.0, 1.0, None, starts, rates, lanes=LANES, **options)
+    sol = mj.solve_ensemble(
+        terms, solver, 0.0, 1.0, None, starts, rates, lanes=LANES, **options, args_axes=0
+    )
     one = lambda y, a: mj.diffeqsolve(terms, solver, 0.0, 1.0, None, y, a, throw=False, **options)
     singles = jax.vmap(one)(starts, rates)
     np.testing.assert_allclose(sol.ys, singles.ys, rtol=0, atol=1e-12)
@@ -342,14 +365,14 @@ def test_stiff_systems_fail_alone():
 def test_large_stiff_systems_take_the_ordinary_way():
     decay = dfx.ODETerm(lambda t, y, args: -args * y)
     starts, rates = jnp.ones((2, 9)), jnp.array([1.0, 2.0])
-    sol = mj.solve_ensemble(decay, mj.Rodas3P(), 0.0, 1.0, 0.1, starts, rates)
+    sol = mj.solve_ensemble(decay, mj.Rodas3P(), 0.0, 1.0, 0.1, starts, rates, args_axes=0)
     assert sol.execution == "mapped over, not in lanes: more than 8 unknowns of a stiff system"
     np.testing.assert_allclose(sol.ys[:, 0, 0], jnp.exp(-rates), rtol=1e-3)
 
 
 def test_too_many_operations_take_the_ordinary_way(monkeypatch):
     monkeypatch.setattr(in_lanes, "_LONGEST", 100)
-    sol = mj.solve_ensemble(TURN, HOOKS["projected"], 0.0, 0.5, 0.1, STARTS, RATES)
+    sol = mj.solve_ensemble(TURN, HOOKS["projected"], 0.0, 0.5, 0.1, STARTS, RATES, args_axes=0)
     assert "more than 100 operations" in sol.execution
     singles = jax.vmap(lambda y, a: alone(HOOKS["projected"], 0.0, 0.5, 0.1, y, a))
     assert_equal(sol, singles(STARTS, RATES))
@@ -358,18 +381,20 @@ def test_too_many_operations_take_the_ordinary_way(monkeypatch):
 @pytest.mark.usefixtures("as_a_user_meets_it")
 def test_bad_arguments():
     def solve(t1=1.0, y=STARTS, args=RATES, **options):
-        return mj.solve_ensemble(TURN, HOOKS["projected"], 0.0, t1, 0.1, y, args, **options)
+        return mj.solve_ensemble(
+            TURN, HOOKS["projected"], 0.0, t1, 0.1, y, args, **{"args_axes": 0, **options}
+        )
 
     with pytest.raises(ValueError, match=r"Leading axes.*'y0s': 7, 'args': 2"):
         solve(args=jnp.ones(2))
-    with pytest.raises(ValueError, match="`args` is one number.*in_axes"):
+    with pytest.raises(ValueError, match="`args` is one number.*args_axes"):
         solve(args=1.0)
     with pytest.raises(ValueError, match="no trajectories"):
         solve(y=STARTS[:0], args=RATES[:0])
     with pytest.raises(ValueError, match="`lanes` must be a positive integer"):
         solve(lanes=0)
-    with pytest.raises(ValueError, match="`in_axes` must be 0 or None"):
-        solve(in_axes=1)
+    with pytest.raises(ValueError, match="`args_axes` must be 0 or None"):
+        solve(args_axes=1)
     with pytest.raises(ValueError, match="`max_steps` must be"):
         solve(max_steps=None)
     with pytest.raises(TypeError, match="`mesh` must be None or a `jax.sharding.Mesh`.*got int"):
@@ -380,7 +405,7 @@ def test_bad_arguments():
     with jax.set_mesh(mesh), pytest.raises(ValueError, match="`mesh` cannot be used inside"):
         solve(mesh=mesh)
     with pytest.raises(ValueError, match="`mesh` is for explicit solvers"):
-        mj.solve_ensemble(TURN, implicit, 0.0, 1.0, 0.1, STARTS, RATES, mesh=mesh)
+        mj.solve_ensemble(TURN, implicit, 0.0, 1.0, 0.1, STARTS, RATES, mesh=mesh, args_axes=0)
     with pytest.raises(TypeError, match="`y0s`"):
         solve(y=jnp.ones((7, 2), int))
     with pytest.raises(RuntimeError, match="`dt0` must have the sign"):

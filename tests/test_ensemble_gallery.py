@@ -45,7 +45,9 @@ def test_each_is_what_it_is_alone(name):
         stepsize_controller=dfx.PIDController(rtol=1e-5, atol=1e-5),
         throw=False,
     )
-    sol = mj.solve_ensemble(problem.terms, solver, t0, t1, None, y0s, args, lanes=2, **options)
+    sol = mj.solve_ensemble(
+        problem.terms, solver, t0, t1, None, y0s, args, lanes=2, **options, args_axes=0
+    )
     assert sol.execution.startswith("mapped over" if name in MAPPED else "in lanes")
     solve = jax.jit(
         lambda y0, args: mj.diffeqsolve(problem.terms, solver, t0, t1, None, y0, args, **options)

@@ -7,7 +7,12 @@ import numpy as np
 import pytest
 
 import manifold_jax as mj
-from manifold_jax._solver.step.execution import CarriedDerivative, execution_of, OwnStep, WrittenOut
+from manifold_jax._solver.step.execution import (
+    CarriedDerivative,
+    execution_of,
+    ExplicitStep,
+    OwnStep,
+)
 from manifold_jax._solver.step.frame import StepFrame
 
 
@@ -66,15 +71,15 @@ def test_explicit_steps(solver, jump):
     """Stage by stage, in a loop, and Diffrax's own. Of methods whose last stage is the first one of
     the next step ours is taken at the corrected state, which Diffrax has not got: there the ways
     are compared with nothing to correct."""
-    assert isinstance(execution_of(solver, TERM, T0, T1, START, SPEED), WrittenOut)
-    check_equal([WrittenOut(solver, False), WrittenOut(solver, True)], jump, True, 1e-15)
+    assert isinstance(execution_of(solver, TERM, T0, T1, START, SPEED), ExplicitStep)
+    check_equal([ExplicitStep(solver, False), ExplicitStep(solver, True)], jump, True, 1e-15)
     frame = StepFrame.of_state(START, TERM, unchanged)
 
     def step(way):
         memory = way.initial_memory(TERM, frame, T0, T1, START, SPEED)
         return way.step(TERM, frame, T0, T1, START, SPEED, memory, False)
 
-    ours, diffrax = step(WrittenOut(solver)), step(OwnStep(solver))
+    ours, diffrax = step(ExplicitStep(solver)), step(OwnStep(solver))
     for name in ("y1", "raw", "error", "dense_info"):
         same = lambda a, b: np.testing.assert_allclose(a, b, atol=1e-15)
         jax.tree.map(same, getattr(ours, name), getattr(diffrax, name))

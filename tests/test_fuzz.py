@@ -45,8 +45,8 @@ def plain_structure(family, **changes):
     return Structure(**fields | changes)
 
 
-def handed_out(lanes, paths):
-    """What a faultless solve would hand out."""
+def saved_value(lanes, paths):
+    """What a faultless solve would return."""
     length = lanes["end"] - lanes["start"]
     states = np.swapaxes(paths(FRACTIONS), 0, 1).copy()
     times = lanes["start"][:, None] + length[:, None] * FRACTIONS
@@ -61,7 +61,7 @@ def faults(spoil):
     paths = reference_paths(one, lanes)
     judge = checks.judge(one, lanes, paths, amplification(one, lanes, paths))
     assert judge.trusted.all()
-    found, failed = handed_out(lanes, paths), handed_out(lanes, paths)
+    found, failed = saved_value(lanes, paths), saved_value(lanes, paths)
     for each in (found, failed):  # the reference is good to twelve digits only
         y = each["states"].reshape(-1, 3)
         args = {name: np.repeat(value, len(FRACTIONS), 0) for name, value in lanes["args"].items()}

@@ -66,7 +66,7 @@ CASES = {
 @pytest.mark.parametrize("name", CASES)
 @pytest.mark.parametrize("far", [False, True])
 def test_derivatives(name, far):
-    """Forward = reverse = differences, to second order; beside the manifold and on it."""
+    """Forward = reverse = differences, to second order; off the manifold and on it."""
     constraint, y = CASES[name]
     x, unravel = jax.flatten_util.ravel_pytree(y)
     v = jnp.asarray(np.random.default_rng(5).normal(size=x.shape))

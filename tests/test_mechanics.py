@@ -556,14 +556,14 @@ BAD_SYSTEMS = {
     "shape of M": (dict(mass_matrix=jnp.ones(3)), "`mass_matrix` must be"),
     "shape of Q": (dict(force=lambda t, q, v, args: jnp.zeros(3)), "`force` must return"),
     "no force": (dict(force=None), "`force` must be a callable"),
-    "no constraint": (dict(constraint=None), "`constraint` is None"),
+    "no constraint": (dict(position_constraint=None), "`position_constraint` is None"),
     "stabilization": (
         dict(stabilization=mj.InvariantStabilization(1.0)),
         "`stabilization` must be",
     ),
     "branches": (
         dict(
-            constraint=lambda t, q, args: jax.lax.cond(
+            position_constraint=lambda t, q, args: jax.lax.cond(
                 q[0] > 0, lambda: jnp.ones(2), lambda: jnp.ones(1)
             )
         ),
@@ -578,7 +578,7 @@ def test_bad_systems(case):
     changed, message = BAD_SYSTEMS[case]
     arguments = dict(
         mass_matrix=1.0,
-        constraint=lambda t, q, args: q @ q - 1.0,
+        position_constraint=lambda t, q, args: q @ q - 1.0,
         force=lambda t, q, v, args: jnp.array([0.0, -GRAVITY]),
     )
 

@@ -65,7 +65,7 @@ def test_ensembles_of_other_numbers_are_not_compiled_again():
             0.1,
             jnp.stack([START, START]),
             arguments(rate),
-            in_axes=None,
+            args_axes=None,
         )
         calls.append(counted.calls)
     assert calls[0] == calls[1]

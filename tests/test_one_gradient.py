@@ -129,7 +129,7 @@ def test_an_ensemble_with_empty_arrays():
 
     def ends(rates):
         parts = dfx.ODETerm(turn), circle, 0.0, 1.0, 0.25, starts, (rates, jnp.zeros((3, 0)))
-        return mj.solve_ensemble(*parts, in_axes=0).ys
+        return mj.solve_ensemble(*parts, args_axes=0).ys
 
     x, empty = ends(rates)
     assert empty.shape[0] == 3

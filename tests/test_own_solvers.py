@@ -239,6 +239,7 @@ def test_gradients_and_batches_of_a_step_hook_of_the_users_own():
         0.05,
         jnp.tile(START, (3, 1)),
         rates,
+        args_axes=0,
     )
     alone = mj.diffeqsolve(TURN, Relaxed(dfx.Heun(), CIRCLE), 0.0, 2.0, 0.05, START, rate)
     np.testing.assert_allclose(together.ys[1], alone.ys, rtol=0, atol=1e-14)

@@ -193,9 +193,11 @@ def test_every_approach_and_an_ensemble(reduced):
         sol = mj.diffeqsolve(dae.terms, hook, *problem, start, args, stepsize_controller=control)
         np.testing.assert_allclose(sol.ys[-1], exact, rtol=0, atol=1e-6)
     many = {**args, "g": jnp.array([5.0, args["g"]])}
-    settings = {"in_axes": {"g": 0, "m": None, "L": None}, "stepsize_controller": control}
+    settings = {"args_axes": {"g": 0, "m": None, "L": None}, "stepsize_controller": control}
     starts = jnp.tile(start, (2, 1))
-    ensemble = mj.solve_ensemble(dae.terms, hooks[0], *problem, starts, many, **settings)
+    ensemble = mj.solve_ensemble(
+        dae.terms, hooks[0], *problem, starts, many, **settings, args_axes=0
+    )
     np.testing.assert_allclose(ensemble.ys[1, -1], exact, rtol=0, atol=1e-6)
 
 

@@ -27,7 +27,7 @@ def largest_difference(a, b):
 
 
 def near(y):
-    """Beside the manifold, everywhere differently."""
+    """Off the manifold, everywhere differently."""
     moved = lambda x: x + 0.01 * jnp.cos(3 * jnp.arange(x.size, dtype=float)).reshape(x.shape)
     return jax.tree.map(moved, y)
 

@@ -63,7 +63,7 @@ def test_each_trajectory_is_what_it_is_in_one_ensemble(whole):
         None,
         y0s,
         args | {"radius": streamed.RADIUS},
-        in_axes={"rate": 0, "radius": None},
+        args_axes={"rate": 0, "radius": None},
         saveat=dfx.SaveAt(ts=jnp.array([0.25, 1.0]), t1=True),
         stepsize_controller=dfx.PIDController(rtol=1e-4, atol=1e-4),
         max_steps=500,

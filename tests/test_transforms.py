@@ -116,7 +116,7 @@ def test_failing_lane_leaves_the_others_bit_identical(controller):
     assert ok(bad).tolist() == [True, True, False, True]
     for lane in (0, 1, 3):
         assert np.array_equal(good.ys[lane], bad.ys[lane])
-    # The failure is named, found quickly, and no value after it is handed out.
+    # The failure is named, found quickly, and no value after it is returned.
     assert np.asarray(bad.result == dfx.RESULTS.nonlinear_divergence)[2]
     assert int(bad.stats["num_steps"][2]) < 300
     assert np.all(np.isinf(bad.ys[2, -2:]))

@@ -52,7 +52,7 @@ def test_stale_derivative_of_a_solver_with_its_own_stages():
 
 
 def test_interpolant_of_a_step_without_projection_is_off():
-    """Why saved values need their own correction: this is what Diffrax alone hands out."""
+    """Why saved values need their own correction: this is what Diffrax alone returns."""
     ts = jnp.linspace(0.0, 3.0, 50)
     options = dict(saveat=dfx.SaveAt(ts=ts), stepsize_controller=ADAPTIVE)
     solver = mj.Projected(dfx.Tsit5(), CIRCLE)

@@ -57,7 +57,7 @@ PEERS = {"casadi": "casadi", "pydiffsol": "pydiffsol", "sksundae": "scikit-sunda
 class Prepared(NamedTuple):
     """A method, ready to run at one tolerance.
 
-    - `run`: solves, and returns whatever the library hands out. This is what is timed.
+    - `run`: solves, and returns whatever the library returns. This is what is timed.
     - `states`: that result to the states on the grid, `(1001, 4)`.
     - `steps`: an untimed solve: the number of accepted steps, and the states at their ends
         if the library gives access to them.

@@ -189,7 +189,9 @@ def in_lanes(args: Any) -> Any:
     controller = dfx.PIDController(rtol=problem.rtol, atol=problem.atol)
     options = dict(stepsize_controller=controller, max_steps=MAX_STEPS)
     terms, solver = terms_of(problem), METHODS["Rodas5P"]
-    return mj.solve_ensemble(terms, solver, 0.0, problem.t1, 1e-4, starts, args, **options).ys[:, 0]
+    return mj.solve_ensemble(
+        terms, solver, 0.0, problem.t1, 1e-4, starts, args, **options, args_axes=0
+    ).ys[:, 0]
 
 
 def print_tables(console: Console, rows: list[Row], batch: list[BatchRow]) -> None:

@@ -121,7 +121,7 @@ def ensemble(
             None,
             y0s,
             args,
-            in_axes=kind(0, None, None),
+            args_axes=kind(0, None, None),
             stepsize_controller=dfx.PIDController(rtol=tolerance, atol=tolerance),
             lanes=lanes,
             mesh=mesh,

@@ -81,5 +81,6 @@ def _steps(eccentricities: Any, lanes: int, tolerance: float) -> jax.Array:
         stepsize_controller=controller,
         lanes=lanes,
         throw=True,
+        args_axes=0,
     )
     return sol.stats["num_steps"]

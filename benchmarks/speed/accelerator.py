@@ -61,7 +61,7 @@ class Case(NamedTuple):
     t1: float
     y0s: Any
     args: Any
-    in_axes: Any
+    args_axes: Any
 
 
 def lorenz(size: int) -> Case:
@@ -77,8 +77,8 @@ def pendulums(size: int) -> Case:
     problem, given = mj.problems.double_pendulum(), double_pendulum.pendulums(size)
     kind = type(problem.args)
     args = kind(given.masses, np.ones(2), np.asarray(9.81))
-    in_axes = kind(0, None, None)
-    return Case(problem.terms, problem.constraint, 5.0, given.y0s, args, in_axes)
+    args_axes = kind(0, None, None)
+    return Case(problem.terms, problem.constraint, 5.0, given.y0s, args, args_axes)
 
 
 CASES = {"lorenz": lorenz, "double_pendulum": pendulums}
@@ -100,7 +100,7 @@ def programs(case: Case, lanes: int, tolerance: float) -> dict[str, Callable]:
             None,
             y0s,
             args,
-            in_axes=case.in_axes,
+            args_axes=case.args_axes,
             stepsize_controller=control,
             lanes=lanes,
         )

@@ -95,7 +95,7 @@ def methods(problem: Problem, saved: int, lanes: int) -> dict[str, Callable]:
         return Outcome(sol.ys, sol.stats["num_steps"])
 
     def ensemble(y0s: Any) -> Outcome:
-        sol = mj.solve_ensemble(*common, y0s, args, in_axes=None, lanes=lanes, **options)
+        sol = mj.solve_ensemble(*common, y0s, args, args_axes=None, lanes=lanes, **options)
         return Outcome(sol.ys, sol.stats["num_steps"])
 
     return {

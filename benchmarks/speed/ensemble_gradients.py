@@ -65,7 +65,7 @@ def solves(problem: Problem) -> dict[str, Callable]:
         return sol.ys, sol.stats["num_steps"]
 
     def ensemble(y0s: Any, args: Any) -> tuple[Any, Any]:
-        sol = mj.solve_ensemble(*common, y0s, args, in_axes=None, stepsize_controller=CONTROLLER)
+        sol = mj.solve_ensemble(*common, y0s, args, args_axes=None, stepsize_controller=CONTROLLER)
         return sol.ys, sol.stats["num_steps"]
 
     def mapped(y0s: Any, args: Any) -> tuple[Any, Any]:

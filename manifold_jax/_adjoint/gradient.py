@@ -1,4 +1,4 @@
-"""A gradient on its way back through a solve, and what it passes."""
+"""A gradient in the reverse sweep of a solve, and what it passes."""
 
 from typing import Any, NamedTuple
 

@@ -1,4 +1,4 @@
-"""What a solve leaves behind for its way back: when each step was made, and from which state."""
+"""What a solve leaves behind for its reverse sweep: when each step was made, and from which state."""
 
 import math
 from collections.abc import Callable

@@ -16,7 +16,7 @@ from .._base.compat import Differentiable, LoopState, Progress
 from .._base.types import Args, RealScalarLike, Y
 from .._constraint.projection_info import ProjectionInfo
 from .._solver.step.advance import HookState
-from .._solver.step.execution import execution_of, WrittenOut
+from .._solver.step.execution import execution_of, ExplicitStep
 from .._solver.step.frame import StepFrame
 
 
@@ -91,7 +91,7 @@ class Solve(NamedTuple):
         begin = Progress.of(init_state)
         # The step of a solver of Diffrax itself is written out, and then remembers nothing.
         execution = execution_of(solver, terms, begin.tprev, begin.tnext, begin.y, args)
-        written_out = isinstance(execution, WrittenOut)
+        written_out = isinstance(execution, ExplicitStep)
         jumps = may_jump(controller, begin.made_jump)
         solver_state = lax.stop_gradient(begin.solver_state)
         return Solve(terms, solver, args, solver_state, not written_out, jumps)
@@ -108,7 +108,7 @@ class Solve(NamedTuple):
         if not self.remembers:
             unchanged = lambda y: (y, ProjectionInfo.of_nothing(y, jnp.asarray(True)))
             frame = StepFrame.of_state(y, terms, unchanged)
-            step = WrittenOut(solver).step(terms, frame, start, end, y, args, None, False)
+            step = ExplicitStep(solver).step(terms, frame, start, end, y, args, None, False)
             return State(step.y1, None), step.dense_info
         solver_state = with_memory(self.solver_state, state.memory)
         y1, _, dense_info, solver_state, _ = solver.step(
@@ -139,7 +139,7 @@ def may_jump(controller: Any, made_jump: Any) -> bool:
     return not isinstance(controller, known)
 
 
-class HandedOut(NamedTuple):
+class SolveOutputs(NamedTuple):
     """What has derivatives of the final state of a loop, of the solver's state what steps depend
     on."""
 
@@ -151,11 +151,11 @@ class HandedOut(NamedTuple):
     state: State
 
     @staticmethod
-    def of(final_state: LoopState, remembers: bool) -> "HandedOut":
+    def of(final_state: LoopState, remembers: bool) -> "SolveOutputs":
         of = Differentiable.of(final_state)
         memory = memory_of(of.solver_state) if remembers else None
         dense = of.dense_ts, of.dense_infos, of.event_dense_info
-        return HandedOut(of.ts, of.ys, *dense, State(of.y, memory))
+        return SolveOutputs(of.ts, of.ys, *dense, State(of.y, memory))
 
     def put_into(self, final_state: LoopState) -> LoopState:
         y, memory = self.state

@@ -1,4 +1,4 @@
-"""The way back through saved values: to the states, steps and times that they are functions of."""
+"""The reverse sweep through saved values: to the states, steps and times that they are functions of."""
 
 from typing import Any, NamedTuple
 

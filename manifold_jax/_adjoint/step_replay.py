@@ -17,12 +17,12 @@ from .._base.compat import (
     while_loop,
 )
 from .._base.derivative_rule import apply_linear, ForwardRule
-from .backwards import Backwards, DenseBars
+from .fixed_steps import event_of_controller, SizesHeldFixed, with_end_held_fixed
 from .gradient import Ends, TimesBar
 from .record import Record, recording
-from .replay import HandedOut, Replay, Solve
+from .replay import Replay, Solve, SolveOutputs
+from .reverse_sweep import DenseBars, ReverseSweep
 from .saved import Functions, Rows, SavedValues
-from .sizes_held_fixed import event_of_controller, SizesHeldFixed, with_end_held_fixed
 
 
 class StepReplayAdjoint(dfx.AbstractAdjoint):
@@ -36,7 +36,7 @@ class StepReplayAdjoint(dfx.AbstractAdjoint):
       \bar\theta = \sum_i (\partial\Phi/\partial\theta)^T \bar y_{i+1} + \dots$$
 
     with $s_i$ what was saved in step $i$, events and the dense solution included. The solve
-    records $(t_i, t_{i+1})$ and some $y_i$, and the way back computes each step once more, of the
+    records $(t_i, t_{i+1})$ and some $y_i$, and the reverse sweep computes each step once more, of the
     size that was recorded. `diffrax.RecursiveCheckpointAdjoint` repeats parts of the solve with its
     controller instead: rounded differently, repeated steps get other sizes, and its gradient is
     that of another solution. At tight tolerances it is less accurate than the solve, and with
@@ -141,8 +141,8 @@ class StepReplayAdjoint(dfx.AbstractAdjoint):
         # What the functions close over becomes their leaves, which have derivatives.
         forward = convert_closure(forward, record)
         differentiable = replay, start, times, forward
-        (final_state, statistics), handed_out, _ = _solve(differentiable, record, solve.remembers)
-        return handed_out.put_into(final_state), statistics
+        (final_state, statistics), saved_value, _ = _solve(differentiable, record, solve.remembers)
+        return saved_value.put_into(final_state), statistics
 
 
 _NO_STEP_SIZES = (
@@ -168,7 +168,7 @@ def _solve(differentiable, record, remembers):
     """What the loop returns, what has derivatives of that, and what reverse mode needs."""
     *_, run = differentiable
     (state, statistics), record = run(record)
-    return (state, statistics), HandedOut.of(state, remembers), (record, state)
+    return (state, statistics), SolveOutputs.of(state, remembers), (record, state)
 
 
 @_solve.define_jvp
@@ -188,7 +188,7 @@ def _solve_jvp(values, primals, tangents):
 
         def final(run):
             (state, _), record = run(empty)
-            values = HandedOut.of(state, remembers), (record, state)
+            values = SolveOutputs.of(state, remembers), (record, state)
             return eqx.filter(values, eqx.is_inexact_array)
 
         return eqx.filter_jvp(final, (differentiable[-1],), (along,))[1]
@@ -205,7 +205,7 @@ def _solve_jvp(values, primals, tangents):
 
 
 def _gradient(differentiable, perturbed, values, bars):
-    _, handed_out, (record, final_state) = values
+    _, saved_value, (record, final_state) = values
     given, beside = bars
     if record is None:
         raise RuntimeError(_UNBOUNDED)
@@ -216,12 +216,12 @@ def _gradient(differentiable, perturbed, values, bars):
     end = Progress.of(final_state)
     bar = jtu.tree_map(
         lambda x, b: jnp.zeros_like(x) if b is None else b,
-        eqx.filter(handed_out, eqx.is_inexact_array),
+        eqx.filter(saved_value, eqx.is_inexact_array),
         given,
     )
     ends = Ends(t0, t1, end.tprev, end.num_steps, end.num_accepted_steps, end.y)
     functions = Functions(*eqx.partition(replay, perturbed[0]))
-    back = Backwards(
+    back = ReverseSweep(
         functions,
         record,
         start,
@@ -235,12 +235,12 @@ def _gradient(differentiable, perturbed, values, bars):
     gradient = back.run(bar.state, timed=any(jtu.tree_leaves(perturbed[2])))
     times = gradient.times or TimesBar(None, None, [None] * len(ts))  # pyright: ignore[reportArgumentType]
     if gradient.times is not None and bar.dense_ts is not None:
-        at = lambda t: jnp.sum(jnp.where(handed_out.dense_ts == t, bar.dense_ts, 0))
+        at = lambda t: jnp.sum(jnp.where(saved_value.dense_ts == t, bar.dense_ts, 0))
         times = times._replace(t0=times.t0 + at(t0), t1=times.t1 + at(t1))
     return gradient.leaves, gradient.state, tuple(times), eqx.filter(run, lambda leaf: False)
 
 
-def _rows(replay: Replay, counts: list[Any], bar: HandedOut, ends: Ends) -> list[Rows]:
+def _rows(replay: Replay, counts: list[Any], bar: SolveOutputs, ends: Ends) -> list[Rows]:
     """Of each saving, with the cotangents of its values; `counts` are times and how many of those
     that were asked for were reached."""
     rows = []

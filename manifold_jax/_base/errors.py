@@ -57,3 +57,19 @@ def _check_call(name: str, signature: inspect.Signature, args: Any, kwargs: Any)
     except TypeError as error:
         names = ", ".join(signature.parameters)
         raise TypeError(f"`mj.{name}` takes the arguments `({names})`: {error}.") from None
+
+
+def refuse_old_names(**names: str) -> Callable[[Function], Function]:
+    """A decorator: arguments that were renamed raise, and say their new name, `old="new"`."""
+
+    def decorate(function: Function) -> Function:
+        @functools.wraps(function)
+        def call(*args: Any, **kwargs: Any) -> Any:
+            __tracebackhide__ = True
+            for old in names.keys() & kwargs.keys():
+                raise TypeError(f"`{old}` has been renamed: write `{names[old]}=`.")
+            return function(*args, **kwargs)
+
+        return cast(Function, call)
+
+    return decorate

@@ -14,7 +14,7 @@ from .._base.types import Args, BoolScalar, RealScalarLike, Residual, ResidualFu
 from .._base.user_functions import check_function
 from .._linalg.rows import multiply
 from .._linalg.sparse import check_choice, Choice, choose_structure, Structure
-from .correction import equations_of, Normals, solve_correction, without_normal_part
+from .correction import ConstraintNormals, equations_of, solve_correction, without_normal_part
 from .projection_info import ProjectionInfo
 from .residual import as_time, residual_vector
 from .settings import NewtonProjection
@@ -92,7 +92,7 @@ class AbstractConstraint(eqx.Module):
 
     def normals(
         self, projection: NewtonProjection, t: RealScalarLike, y: Y, args: Args = None
-    ) -> Normals:
+    ) -> ConstraintNormals:
         """What leads across the manifold at `y`: `G = dg/dy` and the rows of `V^T = G W^-1`, both
         `(m, k)`. `k` is `n`, unless components are moved together (positions and velocities)."""
         return equations_of(self, t, y, args, projection, self.redundant).normals()

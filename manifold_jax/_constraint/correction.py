@@ -24,7 +24,7 @@ from .residual import as_time, jacobian, residual_vector, row_scale
 from .settings import NewtonProjection
 
 
-class Normals(NamedTuple):
+class ConstraintNormals(NamedTuple):
     """What leads across the manifold at a point: the Jacobian `G`, and the directions, the rows of
     `V^T`, along which points nearby are corrected, by default `V = W^-1 G^T`. Both `(m, k)` for
     `k` components that are moved together, by default the `n` of the state."""
@@ -33,21 +33,23 @@ class Normals(NamedTuple):
     directions: Rows
 
 
-class Crossing(NamedTuple):
+class FactoredGram(NamedTuple):
     """The normals at a point with `G V` factored: the linearization of a correction."""
 
-    normals: Normals
+    normals: ConstraintNormals
     factorization: Any  # Factorization | Inverse | PseudoInverse, or that of sparse rows
 
     @staticmethod
-    def of(normals: Normals, redundant: bool, dependent: FloatScalar | float = 1e-4) -> "Crossing":
+    def of(
+        normals: ConstraintNormals, redundant: bool, dependent: FloatScalar | float = 1e-4
+    ) -> "FactoredGram":
         """`dependent` as in `pseudo_invert`, for `redundant` equations."""
         if isinstance(normals.jacobian, AbstractRows):
-            return Crossing(normals, normals.jacobian.factorize(normals.directions))
+            return FactoredGram(normals, normals.jacobian.factorize(normals.directions))
         A = gram(*normals)
         if not redundant:
-            return Crossing(normals, factorize_once(A))
-        return Crossing(normals, pseudo_invert(A, equilibrated=True, dependent=dependent))
+            return FactoredGram(normals, factorize_once(A))
+        return FactoredGram(normals, pseudo_invert(A, equilibrated=True, dependent=dependent))
 
     def solve(self, b: Float[Array, " m"]) -> Float[Array, " m"]:
         return self.factorization.solve(b)
@@ -81,40 +83,42 @@ class CorrectionEquations(AbstractEquations):
         (d,) = pullback(z)
         return self.x + (d if self.inverse_metric is None else self.inverse_metric * d)
 
-    def linearize(self, x: Float[Array, " n"]) -> Crossing:
+    def linearize(self, x: Float[Array, " n"]) -> FactoredGram:
         if isinstance(self.directions, AbstractRows):
             rows = self.directions.of_other(self.function, self.t, x, self.args)
-            return Crossing.of(Normals(rows, self.directions), self.redundant)
+            return FactoredGram.of(ConstraintNormals(rows, self.directions), self.redundant)
         G = self._rows(x)
         if self.directions is not None:
-            return Crossing.of(Normals(G, self.directions), self.redundant)
+            return FactoredGram.of(ConstraintNormals(G, self.directions), self.redundant)
         at_start = self.normals()
         # `G V` of two points, whose dependence differs by the distance between them.
         dependent = _dependent(1e3 * self.level(at_start)) if self.redundant else 0.0
-        return Crossing.of(Normals(G, at_start.directions), self.redundant, dependent)
+        return FactoredGram.of(ConstraintNormals(G, at_start.directions), self.redundant, dependent)
 
-    def crossing(self) -> Crossing:
+    def factored(self) -> FactoredGram:
         """At the point that is corrected."""
         normals = self.normals()
-        # Equations that depend on each other on the manifold do so beside it up to the distance.
+        # Equations that depend on each other on the manifold do so off it up to the distance.
         dependent = _dependent(1e6 * self.level(normals) ** 2) if self.redundant else 0.0
-        return Crossing.of(normals, self.redundant, dependent)
+        return FactoredGram.of(normals, self.redundant, dependent)
 
-    def normals(self) -> Normals:
+    def normals(self) -> ConstraintNormals:
         G = self._rows(self.x)
         if self.directions is not None:
-            return Normals(G, self.directions)
+            return ConstraintNormals(G, self.directions)
         if self.inverse_metric is None:
-            return Normals(G, G)
+            return ConstraintNormals(G, G)
         metric = InverseWeights(self.inverse_metric)
-        return Normals(G, G.along(metric) if isinstance(G, SparseRows) else metric.solve(G))
+        return ConstraintNormals(
+            G, G.along(metric) if isinstance(G, SparseRows) else metric.solve(G)
+        )
 
     def _rows(self, x: Float[Array, " n"]) -> Rows:
         if self.structure is None:
             return jacobian(self.residual, x)[1]
         return SparseRows(self.function, self.t, x, self.args, self.structure)
 
-    def level(self, normals: Normals) -> FloatScalar:
+    def level(self, normals: ConstraintNormals) -> FloatScalar:
         """How far from the manifold the point is."""
         return jnp.max(jnp.abs(self.residual(self.x)) / row_scale(normals.jacobian, self.x))
 
@@ -141,21 +145,21 @@ def solve_correction(
     safe: Float[Array, " n"],
     projection: NewtonProjection,
     far: bool,
-    crossing: Crossing | None = None,
+    factored: FactoredGram | None = None,
 ) -> CorrectionRoot:
     """The root that the settings in `projection` lead to.
 
     The derivative of a failed correction is taken at `safe`. Corrections that share a
-    Jacobian and its factorization pass them on as `crossing`.
+    Jacobian and its factorization pass them on as `factored`.
     """
     if projection.max_steps == 1 and not far:
-        return _correct_once(equations, safe, crossing)
+        return _correct_once(equations, safe, factored)
     tolerance = projection.tolerance_for(equations.x.dtype)
-    return _solve(equations, safe, projection.max_steps, tolerance, far, crossing)
+    return _solve(equations, safe, projection.max_steps, tolerance, far, factored)
 
 
 def _correct_once(
-    equations: CorrectionEquations, safe: Float[Array, " n"], crossing: Crossing | None
+    equations: CorrectionEquations, safe: Float[Array, " n"], factored: FactoredGram | None
 ) -> CorrectionRoot:
     """One Newton step, `x - V (G V)^-1 g(x)`, successful if it lowers the residual.
 
@@ -163,9 +167,9 @@ def _correct_once(
     """
     finite = jnp.all(jnp.isfinite(equations.x))
     equations = equations.starting_at(jnp.where(finite, equations.x, safe))
-    if crossing is None:
-        crossing = equations.crossing()
-    (G, directions), factorization = crossing
+    if factored is None:
+        factored = equations.factored()
+    (G, directions), factorization = factored
     scale = row_scale(G, equations.x)
     r = equations.residual(equations.x)
     z = -factorization.solve(r)
@@ -186,18 +190,18 @@ def _solve(
     max_steps: int,
     tolerance: Any,
     far: bool,
-    crossing: Crossing | None,
+    factored: FactoredGram | None,
 ) -> CorrectionRoot:
     del safe
-    if crossing is None:
-        crossing = equations.crossing()
-    (G, directions), factorization = crossing
+    if factored is None:
+        factored = equations.factored()
+    (G, directions), factorization = factored
     r = equations.residual(equations.x)
     fixed, scale, z = equations.along(directions), row_scale(G, equations.x), jnp.zeros_like(r)
     if far:
         root = damped_newton(fixed, z, r, scale, max_steps, tolerance)
     else:
-        root = chord(fixed, crossing, z, r, scale, max_steps)
+        root = chord(fixed, factored, z, r, scale, max_steps)
     full_rank = factorization.full_rank
     success = (root.level <= tolerance) & full_rank
     p = jnp.where(success, fixed.point(root.z), equations.x)
@@ -211,8 +215,8 @@ def _solve_jvp(root, primals, tangents):
     # differentiating: selecting afterwards would leave 0 * NaN in reverse mode.
     equations = equations.starting_at(jnp.where(root.success, equations.x, safe))
     z = jnp.where(root.success, root.z, 0)
-    dz, moved, crossing = implicit_tangent(equations, tangents[0], z)
-    p_dot = moved + combine(dz, crossing.normals.directions)  # pyright: ignore[reportAttributeAccessIssue]
+    dz, moved, factored = implicit_tangent(equations, tangents[0], z)
+    p_dot = moved + combine(dz, factored.normals.directions)  # pyright: ignore[reportAttributeAccessIssue]
     return CorrectionRoot(p_dot, dz, None, jnp.zeros_like(root.residual), None, None)  # pyright: ignore[reportArgumentType]
 
 
@@ -238,7 +242,10 @@ def equations_of(
 
 
 def without_normal_part(
-    normals: Normals, e: Float[Array, " k"], rate: Float[Array, " m"], redundant: bool = False
+    normals: ConstraintNormals,
+    e: Float[Array, " k"],
+    rate: Float[Array, " m"],
+    redundant: bool = False,
 ) -> Float[Array, " k"]:
     """`e - V (G V)^-1 rate`, tangent if `rate = G e`."""
-    return e - combine(Crossing.of(normals, redundant).solve(rate), normals.directions)
+    return e - combine(FactoredGram.of(normals, redundant).solve(rate), normals.directions)

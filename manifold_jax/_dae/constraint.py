@@ -16,9 +16,9 @@ from .._constraint.checks import check_state
 from .._constraint.constraint import AbstractConstraint
 from .._constraint.residual import as_time
 from .._linalg.newton import implicit_root
-from .closing import Closing, Static
 from .derivatives import pick, total_derivatives
 from .equations import Equations
+from .highest_derivatives import HighestDerivatives, Static
 
 
 _SINGULAR = (
@@ -33,8 +33,8 @@ class Reduced(eqx.Module):
     equations: Equations
     static: Static = eqx.field(static=True)
 
-    def closing(self, t: Any, z: Array, args: Args) -> Closing:
-        return Closing(self.equations, as_time(t, z.dtype), z, args, self.static)
+    def closing(self, t: Any, z: Array, args: Args) -> HighestDerivatives:
+        return HighestDerivatives(self.equations, as_time(t, z.dtype), z, args, self.static)
 
     def split(self, y: Y) -> tuple[Array, Array | None]:
         """The state `z`, and the leading derivatives where they belong to it."""

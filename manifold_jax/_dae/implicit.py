@@ -14,8 +14,8 @@ from jaxtyping import Array, Float
 from .._base.types import Args, BoolScalar, RealScalarLike
 from .._constraint.settings import NewtonProjection
 from .._linalg.newton import AbstractEquations, damped_newton, implicit_root, without_derivative
-from .closing import Closing
 from .constraint import Reduced
+from .highest_derivatives import HighestDerivatives
 from .layout import Layout
 from .pivots import Pivoted
 
@@ -40,7 +40,7 @@ def implicit_field(
 class _Leading(AbstractEquations):
     """The closing equations, for `w`."""
 
-    closing: Closing
+    closing: HighestDerivatives
 
     def point(self, z: Float[Array, " k"]) -> Float[Array, " k"]:
         return z
@@ -52,7 +52,9 @@ class _Leading(AbstractEquations):
         return Pivoted.of(self.closing.matrix(x))
 
 
-def leading(closing: Closing, guess: Float[Array, " k"]) -> tuple[Float[Array, " k"], BoolScalar]:
+def leading(
+    closing: HighestDerivatives, guess: Float[Array, " k"]
+) -> tuple[Float[Array, " k"], BoolScalar]:
     """The derivatives near a guess, and whether they solve the equations."""
     equations = _Leading(closing)
     fixed, start = without_derivative((equations, guess))

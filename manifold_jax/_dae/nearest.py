@@ -88,10 +88,10 @@ class _LeastChange(NamedTuple):
 
     G: Float[Array, "m n"]
     directions: Float[Array, "m n"]
-    crossing: Pivoted
+    factored: Pivoted
 
     def solve(self, b: Float[Array, " m"]) -> Float[Array, " n"]:
-        return combine(self.crossing.solve(b), self.directions)
+        return combine(self.factored.solve(b), self.directions)
 
 
 def _across(g: Constrained, z: Float[Array, " n"]) -> tuple[Float[Array, " m"], _LeastChange]:
@@ -121,7 +121,7 @@ def _approach(g: Constrained, guess: Float[Array, " n"], m: int) -> _Approach:
     def advance(state: _Approach) -> _Approach:
         offset = guess - state.z
         r, across = _across(g, state.z)
-        multipliers = across.crossing.solve(multiply(across.G, offset))
+        multipliers = across.factored.solve(multiply(across.G, offset))
         along = offset - combine(multipliers, across.directions)
         step = across.solve(r)
         there = jnp.max(jnp.abs(step)) <= 1e-2 * (1 + jnp.max(jnp.abs(state.z)))

@@ -13,11 +13,11 @@ import numpy as np
 from .._base.numbers import with_arrays
 from .._base.types import Args, Y
 from .aliases import Aliases, lifted
-from .closing import Plan, Static
 from .combined import cancelled
 from .compressed import Compressed
 from .constraint import Reduced
 from .equations import Equations, listed
+from .highest_derivatives import Plan, Static
 from .layout import Layout
 from .occurrence import Occurrence, Point
 from .pivots import Elimination

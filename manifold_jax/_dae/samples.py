@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from .closing import Closing, Plan, Static
 from .compressed import Compressed
 from .equations import Equations
+from .highest_derivatives import HighestDerivatives, Plan, Static
 from .layout import Layout
 from .occurrence import Point
 from .pivots import Elimination
@@ -46,7 +46,7 @@ class Samples(NamedTuple):
         @jax.jit
         def matrix(t: Array, y: Array, args: object) -> Array:
             args, states = eqx.combine(args, point.fixed_args), layout.num_states
-            return Closing(equations, t, y[:states], args, static).matrix(y[states:])
+            return HighestDerivatives(equations, t, y[:states], args, static).matrix(y[states:])
 
         matrices = []
         for t, y in _points(layout, np.asarray(point.jets[0])):

@@ -177,7 +177,7 @@ def factorize(A: Float[Array, "m m"], redundant: bool = False) -> Factorization 
     return Factorization(A, lu, full_rank)
 
 
-# Equations that depend on each other on the manifold do so only nearly at a stage beside it:
+# Equations that depend on each other on the manifold do so only nearly at a stage off it:
 # eigenvalues of `A` below this fraction of the largest count as zero.
 _DEPENDENT = 1e-4
 

@@ -18,7 +18,7 @@ from .rows import combine
 LARGEST_WRITTEN_OUT = 4
 
 
-class WrittenOut(eqx.Module):
+class UnrolledElimination(eqx.Module):
     """`E A = U`, upper triangular, with the inverses of the pivots on the diagonal. No row exchange is
     left for the right-hand sides."""
 
@@ -64,7 +64,7 @@ class PivotedFactorization(eqx.Module):
     """
 
     A: Float[Array, "n n"]
-    held: WrittenOut | Library  # fixed
+    held: UnrolledElimination | Library  # fixed
     regular: BoolScalar
 
     def solve(self, b: Float[Array, " n"]) -> Float[Array, " n"]:
@@ -93,7 +93,7 @@ def _lapack(A: Float[Array, "n n"]) -> tuple[Library, BoolScalar]:
     return Library((lu, pivots)), regular
 
 
-def _eliminate(A: Float[Array, "n n"]) -> tuple[WrittenOut, BoolScalar]:
+def _eliminate(A: Float[Array, "n n"]) -> tuple[UnrolledElimination, BoolScalar]:
     """The largest entry of a column becomes its pivot by exchanges of two rows each, which need no
     index that is known only while running."""
     n = A.shape[0]
@@ -117,4 +117,4 @@ def _eliminate(A: Float[Array, "n n"]) -> tuple[WrittenOut, BoolScalar]:
     # Of a singular matrix that of the identity.
     U = [[jnp.where(regular, rows[i][j], float(i == j)) for j in range(n)] for i in range(n)]
     E = jnp.where(regular, jnp.stack([jnp.stack(row[n:]) for row in rows]), eye)
-    return WrittenOut(U, E), regular
+    return UnrolledElimination(U, E), regular

@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 import manifold_jax as mj
 
 
-# Beside the manifold: squares of singular values within 1/2 of 1 have converged after 4 iterations.
+# Off the manifold: squares of singular values within 1/2 of 1 have converged after 4 iterations.
 _CONVERGES, _NEAR = 0.5, 4
 # From anywhere: the smallest singular value grows by 1.875 at first, 1e-12 of the largest needs 44.
 _FAR = 52

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 
 from .._base.types import Args, BoolScalar, RealScalarLike, Y
 from .._constraint.constraint import AbstractConstraint
-from .._constraint.correction import Normals, without_normal_part
+from .._constraint.correction import ConstraintNormals, without_normal_part
 from .._constraint.projection_info import ProjectionInfo
 from .._constraint.residual import as_time, residual_vector
 from .._constraint.settings import NewtonProjection
@@ -36,7 +36,7 @@ class MechanicalConstraint(AbstractConstraint):
 
     Built by `MechanicalSystem.constraint`. Corrections use its structure: first the positions,
     then the velocities, which is a linear problem, with the same matrix. The derivative of
-    `J v` is never formed. Normals are those of the velocities.
+    `J v` is never formed. ConstraintNormals are those of the velocities.
     """
 
     holonomic: Callable | None
@@ -61,7 +61,7 @@ class MechanicalConstraint(AbstractConstraint):
         corrected, roots = stages.correct(y, fallback, far)
         return corrected, ProjectionInfo.of_correction(x, *roots)
 
-    def normals(self, projection, t, y, args=None) -> Normals:
+    def normals(self, projection, t, y, args=None) -> ConstraintNormals:
         stages = self._stages(projection, t, y, args, None).dense()
         return stages.normals(*stages.equations.flat(y)).normals
 
@@ -82,11 +82,11 @@ class MechanicalConstraint(AbstractConstraint):
         t = as_time(t, x.dtype)
         C, p = equations.dense().rows(t, x, w, args)
         if p > 0:
-            positions = Normals(C[:p], directions[:p])
+            positions = ConstraintNormals(C[:p], directions[:p])
             e_x = without_normal_part(positions, e_x, multiply(C[:p], e_x), self.redundant)
         velocity = lambda x, w: equations.velocity(t, w, (x, args))
         _, rate = jax.jvp(velocity, (x, w), (e_x, e_w))
-        e_w = without_normal_part(Normals(C, directions), e_w, rate, self.redundant)
+        e_w = without_normal_part(ConstraintNormals(C, directions), e_w, rate, self.redundant)
         return equations.unravel(e_x), equations.unravel(e_w)
 
     def faults(self, t, y, args=None) -> tuple[tuple[BoolScalar, str], ...]:

@@ -20,10 +20,10 @@ from jaxtyping import Array, Float
 from .._base.closure import convert_closure
 from .._base.types import Args, BoolScalar, Y
 from .._constraint.correction import (
+    ConstraintNormals,
     CorrectionEquations,
     CorrectionRoot,
-    Crossing,
-    Normals,
+    FactoredGram,
     solve_correction,
 )
 from .._constraint.settings import NewtonProjection
@@ -76,13 +76,13 @@ class TwoStages(NamedTuple):
         finite = jnp.all(jnp.isfinite(x)) & jnp.all(jnp.isfinite(w))
         x, w = jnp.where(finite, x, safe_x), jnp.where(finite, w, safe_w)
 
-        crossing, p = self._crossing(x, w)
-        positions = self._positions(x, safe_x, crossing, p, far)
+        factored, p = self._factored(x, w)
+        positions = self._positions(x, safe_x, factored, p, far)
         if far:  # the matrix at the corrected positions: the nearest velocities
-            crossing, _ = self._crossing(positions.p, w)
+            factored, _ = self._factored(positions.p, w)
         # Velocities are found by one iteration unless their equations are the user's.
         far = far and self.equations.nonholonomic is not None
-        velocities = self._velocities(positions.p, w, safe_w, crossing, far)
+        velocities = self._velocities(positions.p, w, safe_w, factored, far)
         corrected = tuple(
             equations.unravel(jnp.where(finite, root.p, jnp.nan))
             for root in (positions, velocities)
@@ -97,55 +97,55 @@ class TwoStages(NamedTuple):
         elif directions is None:
             mass = self.equations.mass(self.t, x, w, self.args, C)
             directions, valid = directions_of(mass, C), mass.valid
-        return MechanicalNormals(Normals(C, directions), p, valid)
+        return MechanicalNormals(ConstraintNormals(C, directions), p, valid)
 
-    def _crossing(self, x: Float[Array, " k"], w: Float[Array, " k"]) -> tuple[Crossing, int]:
+    def _factored(self, x: Float[Array, " k"], w: Float[Array, " k"]) -> tuple[FactoredGram, int]:
         normals, p, valid = self.normals(x, w)
-        crossing = Crossing.of(normals, self.redundant)
-        full_rank = crossing.factorization.full_rank & valid
-        factorization = dataclasses.replace(crossing.factorization, full_rank=full_rank)
-        return Crossing(normals, factorization), p
+        factored = FactoredGram.of(normals, self.redundant)
+        full_rank = factored.factorization.full_rank & valid
+        factorization = dataclasses.replace(factored.factorization, full_rank=full_rank)
+        return FactoredGram(normals, factorization), p
 
-    def _positions(self, x, safe, crossing: Crossing, p: int, far: bool) -> CorrectionRoot:
+    def _positions(self, x, safe, factored: FactoredGram, p: int, far: bool) -> CorrectionRoot:
         if p == 0:
             return _nothing_to_do(x)
         if self.equations.nonholonomic is not None or self.metrics is not None:
-            normals = self._position_normals(x, crossing.normals, p)
-            crossing = Crossing.of(normals, self.redundant)
+            normals = self._position_normals(x, factored.normals, p)
+            factored = FactoredGram.of(normals, self.redundant)
         residual = convert_closure(self.equations.position, self.t, x, self.args)
-        return self._solve(residual, x, self.args, safe, crossing, far)
+        return self._solve(residual, x, self.args, safe, factored, far)
 
-    def _position_normals(self, x, normals: Normals, p: int) -> Normals:
+    def _position_normals(self, x, normals: ConstraintNormals, p: int) -> ConstraintNormals:
         (C, directions), metrics = normals, self.metrics
         J = self.equations.position_rows(self.t, x, x, self.args, C, p)
         if metrics is not None:  # one for positions of its own
-            return Normals(J, directions_of(InverseWeights(metrics.positions), J))
+            return ConstraintNormals(J, directions_of(InverseWeights(metrics.positions), J))
         if isinstance(J, SparseRows):
-            return Normals(J, J.along(directions.metric))
-        return Normals(J, directions[:p])
+            return ConstraintNormals(J, J.along(directions.metric))
+        return ConstraintNormals(J, directions[:p])
 
-    def _velocities(self, x, w, safe, crossing: Crossing, far: bool) -> CorrectionRoot:
+    def _velocities(self, x, w, safe, factored: FactoredGram, far: bool) -> CorrectionRoot:
         context = (x, self.args)
         residual = convert_closure(self.equations.velocity, self.t, w, context)
-        return self._solve(residual, w, context, safe, crossing, far)
+        return self._solve(residual, w, context, safe, factored, far)
 
-    def _solve(self, residual, x, args, safe, crossing: Crossing, far: bool) -> CorrectionRoot:
+    def _solve(self, residual, x, args, safe, factored: FactoredGram, far: bool) -> CorrectionRoot:
         equations = CorrectionEquations(
             residual,
             self.t,
             x,
             args,
-            directions=crossing.normals.directions,
+            directions=factored.normals.directions,
             redundant=self.redundant,
         )
-        return solve_correction(equations, safe, self.projection, far, crossing)
+        return solve_correction(equations, safe, self.projection, far, factored)
 
 
 class MechanicalNormals(NamedTuple):
     """With respect to the velocities; how many of the rows belong to positions, and whether the
     mass matrix can be used."""
 
-    normals: Normals
+    normals: ConstraintNormals
     num_positions: int
     valid: BoolScalar
 

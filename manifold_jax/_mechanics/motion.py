@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 from .._base.types import Args, BoolScalar, RealScalarLike, Y
 from .._linalg.dense import Factorization, factorize, gram, gram_written_out, UNROLL_LIMIT
 from .._linalg.rows import AbstractRows, combine, multiply
-from .further import split
+from .auxiliary import split
 from .kinematics import check_mechanical_state, Kinematics
 from .mass import directions_of
 from .saddle_point import Factored, solve_held_fixed
@@ -25,7 +25,7 @@ class LagrangianForce(eqx.Module):
     applied: Callable | None
 
     def __call__(self, t: RealScalarLike, q: Y, v: Y, *rest: Any) -> Y:
-        """`rest` are further states, if there are any, and the args."""
+        """`rest` are auxiliary states, if there are any, and the args."""
         args = rest[-1]
         x, unravel = jfu.ravel_pytree(q)
         w, _ = jfu.ravel_pytree(v)
@@ -47,16 +47,16 @@ class Motion:
     """Everything at one state: `C a = -bias`, the mass matrix, and `C M^-1 C^T`, factored."""
 
     def __init__(self, system: Any, t: RealScalarLike, y: Y, args: Args):
-        state = y if system.further is None else split(y)[0]
+        state = y if system.auxiliary is None else split(y)[0]
         q, v = check_mechanical_state(state)
-        further = () if system.further is None else y[2:]
+        auxiliary = () if system.auxiliary is None else y[2:]
         self.equations = Kinematics.of(system, state)
         self.unravel = self.equations.unravel
         self.x, self.w = self.equations.flat(state)
         self.t, self.args = jnp.asarray(t, self.x.dtype), args
         self.C, self.num_positions = self.equations.rows(self.t, self.x, self.w, args)
         self.bias = self.equations.acceleration_bias(self.t, self.x, self.w, args)
-        self.force = _flat_force(system.force(t, q, v, *further, args), q, self.x)
+        self.force = _flat_force(system.force(t, q, v, *auxiliary, args), q, self.x)
         self.mass = self.equations.mass(self.t, self.x, self.w, args, self.C)
         self.directions = directions_of(self.mass, self.C)
         self.redundant = system.redundant
@@ -116,7 +116,7 @@ class Motion:
 
 def _agree(C: Float[Array, "m n"], a: Float[Array, " n"], bias: Float[Array, " m"]) -> BoolScalar:
     """Whether `C a = -bias` but for what equations that depend on each other contradict each other at a
-    stage beside the manifold. If not, an independent one was taken for dependent."""
+    stage off the manifold. If not, an independent one was taken for dependent."""
     C, a, bias = jax.lax.stop_gradient((C, a, bias))
     sizes = jnp.abs(C)
     own = sizes @ jnp.abs(a) + jnp.abs(bias)

@@ -9,13 +9,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from .._base.errors import refuse_old_names
 from .._base.types import Args, RealScalarLike, Y
 from .._base.user_functions import check_function
 from .._constraint.constraint import AbstractConstraint
 from .._linalg.sparse import check_choice, Choice
 from .._solver.terms import DirectedTerm
+from .auxiliary import check_auxiliary_rates, ExtendedConstraint
 from .constraint import MechanicalConstraint
-from .further import check_further_rates, ExtendedConstraint
 from .mass import ConfigurationMass, LagrangianMass
 from .motion import LagrangianForce, Motion
 from .stabilization import Baumgarte, VelocityStabilization
@@ -29,7 +30,7 @@ class MechanicalSystem(eqx.Module):
     ```python
     rod = mj.MechanicalSystem(
         mass_matrix=1.0,
-        constraint=lambda t, q, args: q @ q - 1.0,
+        position_constraint=lambda t, q, args: q @ q - 1.0,
         force=lambda t, q, v, args: jnp.array([0.0, -9.81]),
     )
     sol = mj.diffeqsolve(rod.terms, mj.Projected(dfx.Tsit5(), rod.constraint), ...)
@@ -46,22 +47,22 @@ class MechanicalSystem(eqx.Module):
         structure and shapes of `q`, or in the order of `ravel_pytree(q)` a symmetric matrix
         `(n, n)` or the blocks on its diagonal, `(bodies, d, d)` with `n = bodies * d`. A matrix may
         be singular as long as no motion that the constraints allow is without mass (quaternions).
-    - `constraint`: `phi(t, q, args)`, any pytree of real arrays; time-dependent (rheonomic)
+    - `position_constraint`: `phi(t, q, args)`, any pytree of real arrays; time-dependent (rheonomic)
         constraints are allowed. `None` if there are only constraints on velocities.
     - `force`: `Q(t, q, v, args)`, like `q`: applied forces and, for configuration-dependent
         masses, the gyroscopic terms. [`MechanicalSystem.from_lagrangian`][] derives those.
     - `velocity_constraint`: `a(t, q, v, args) = A(t, q) v - b(t, q)`, constraints that are not
         derivatives of positions (nonholonomic): rolling, skating.
-    - `further`: `z' = h(t, q, v, z, args)`, equations of further states `z` (any pytree): actuators,
+    - `auxiliary`: `z' = h(t, q, v, z, args)`, equations of auxiliary states `z` (any pytree): actuators,
         controllers, quadratures. The state is `(q, v, z)` then, and the force
         `Q(t, q, v, z, args)`; corrections leave `z` as it is.
-    - `further_constraint`: a constraint on `z` alone, such as [`Sphere`][], which corrects it.
+    - `auxiliary_constraint`: a constraint on `z` alone, such as [`Sphere`][], which corrects it.
     - `stabilization`: [`Baumgarte`][] or [`VelocityStabilization`][]; not needed with
         [`Projected`][] or [`LocalCoordinates`][].
     - `redundant`: constraints may depend on each other (closed loops described twice). The
         accelerations are those of the independent ones, the multipliers those with the least
         forces. Otherwise dependent constraints give an error at the start. What counts as
-        dependent is decided anew in every evaluation, also beside the manifold: directions in
+        dependent is decided anew in every evaluation, also off the manifold: directions in
         which the equations, each scaled to a gradient of length one, are a hundred times weaker
         than in the strongest. Keep tolerances below about 1e-3. Where an independent equation is
         taken for dependent and not satisfied for it, accelerations are NaN.
@@ -87,46 +88,56 @@ class MechanicalSystem(eqx.Module):
     nonholonomic: Callable | None
     mass_matrix: Callable
     force: Callable
-    further: Callable | None
-    further_constraint: AbstractConstraint | None
+    auxiliary: Callable | None
+    auxiliary_constraint: AbstractConstraint | None
     stabilization: Baumgarte | VelocityStabilization | None
     redundant: bool = eqx.field(static=True)
     structure: Choice = eqx.field(static=True)
 
+    @refuse_old_names(
+        constraint="position_constraint",
+        further="auxiliary",
+        further_constraint="auxiliary_constraint",
+    )
     def __init__(
         self,
         mass_matrix: Any,
-        constraint: Callable | None,
+        position_constraint: Callable | None,
         force: Callable,
         *,
         velocity_constraint: Callable | None = None,
-        further: Callable | None = None,
-        further_constraint: AbstractConstraint | None = None,
+        auxiliary: Callable | None = None,
+        auxiliary_constraint: AbstractConstraint | None = None,
         stabilization: Baumgarte | VelocityStabilization | None = None,
         redundant: bool = False,
         structure: Choice = "auto",
     ):
-        _check_arguments(constraint, force, velocity_constraint, stabilization, further)
-        _check_further(further, further_constraint)
+        _check_arguments(position_constraint, force, velocity_constraint, stabilization, auxiliary)
+        _check_auxiliary(auxiliary, auxiliary_constraint)
         check_choice(structure, redundant)
         own = isinstance(mass_matrix, LagrangianMass | ConfigurationMass)  # of another system
         if callable(mass_matrix) and not own:
             check_function("mass_matrix", mass_matrix, "M(q, args)")
         self.mass_matrix = mass_matrix if own else ConfigurationMass(mass_matrix)
-        self.holonomic = constraint
+        self.holonomic = position_constraint
         self.nonholonomic = velocity_constraint
         self.force = force
-        self.further = further
-        self.further_constraint = further_constraint
+        self.auxiliary = auxiliary
+        self.auxiliary_constraint = auxiliary_constraint
         self.stabilization = stabilization
         self.redundant = redundant
         self.structure = structure
 
     @classmethod
+    @refuse_old_names(
+        constraint="position_constraint",
+        further="auxiliary",
+        further_constraint="auxiliary_constraint",
+    )
     def from_lagrangian(
         cls,
         lagrangian: Callable,
-        constraint: Callable | None,
+        position_constraint: Callable | None,
         force: Callable | None = None,
         **kwargs,
     ) -> "MechanicalSystem":
@@ -137,7 +148,7 @@ class MechanicalSystem(eqx.Module):
         **Arguments:**
 
         - `lagrangian`: `L(t, q, v, args)`, a scalar.
-        - `constraint`, and by keyword `velocity_constraint`, `stabilization`, `redundant`: as
+        - `position_constraint`, and by keyword `velocity_constraint`, `stabilization`, `redundant`: as
             for [`MechanicalSystem`][]. The mass matrix is a full one, so that matrices are dense.
         - `force`: forces that have no potential, such as friction; `None` for none.
 
@@ -146,9 +157,9 @@ class MechanicalSystem(eqx.Module):
         """
         check_function("lagrangian", lagrangian, "L(t, q, v, args)")
         if force is not None:
-            _check_force(force, kwargs.get("further"))
+            _check_force(force, kwargs.get("auxiliary"))
         mass = LagrangianMass(lagrangian)
-        return cls(mass, constraint, LagrangianForce(lagrangian, force), **kwargs)
+        return cls(mass, position_constraint, LagrangianForce(lagrangian, force), **kwargs)
 
     @property
     def constraint(self) -> MechanicalConstraint | ExtendedConstraint:
@@ -162,8 +173,8 @@ class MechanicalSystem(eqx.Module):
         )
         return (
             motion
-            if self.further is None
-            else ExtendedConstraint(motion=motion, further=self.further_constraint)  # pyright: ignore[reportCallIssue]
+            if self.auxiliary is None
+            else ExtendedConstraint(motion=motion, auxiliary=self.auxiliary_constraint)  # pyright: ignore[reportCallIssue]
         )
 
     @property
@@ -179,7 +190,7 @@ class MechanicalSystem(eqx.Module):
         return motion.unravel(motion.solve(motion.bias)[0])
 
     def multipliers(self, t: RealScalarLike, y: Y, args: Args = None) -> Float[Array, " m"]:
-        """`lambda` of `M a + J^T lambda = Q`: first those of `constraint` in the order of
+        """`lambda` of `M a + J^T lambda = Q`: first those of `position_constraint` in the order of
         `ravel_pytree`, then those of `velocity_constraint`. The constraint force on the
         coordinates is `-J^T lambda`. With `redundant=True` the solution with the least forces, the sum of
         `lambda_i^2 (J M^-1 J^T)_ii`."""
@@ -192,13 +203,13 @@ class MechanicalSystem(eqx.Module):
         velocity = y[1]
         if isinstance(self.stabilization, VelocityStabilization):
             velocity = motion.unravel(motion.stabilized_velocity())
-        return velocity, motion.unravel(a), *self._further_rates(t, y, args)
+        return velocity, motion.unravel(a), *self._auxiliary_rates(t, y, args)
 
-    def _further_rates(self, t: RealScalarLike, y: Y, args: Args) -> tuple[Y, ...]:
-        if self.further is None:
+    def _auxiliary_rates(self, t: RealScalarLike, y: Y, args: Args) -> tuple[Y, ...]:
+        if self.auxiliary is None:
             return ()
-        rates = self.further(t, *y, args)
-        check_further_rates(rates, y[2])
+        rates = self.auxiliary(t, *y, args)
+        check_auxiliary_rates(rates, y[2])
         return (rates,)
 
     def _stabilized_field(self, t: RealScalarLike, y: Y, args: Args) -> tuple[Y, Y]:
@@ -214,21 +225,25 @@ class MechanicalSystem(eqx.Module):
         a, _ = motion.solve(stiffness)
         damping = motion.constrained(alpha * rate.at[:p].multiply(2))
         still = jax.tree_util.tree_map(jnp.zeros_like, y)
-        field = y[1], motion.unravel(a), *self._further_rates(t, y, args)
+        field = y[1], motion.unravel(a), *self._auxiliary_rates(t, y, args)
         return field, (still[0], motion.unravel(-damping), *still[2:])
 
 
 def _check_arguments(
-    constraint: Any, force: Any, velocity_constraint: Any, stabilization: Any, further: Any
+    position_constraint: Any,
+    force: Any,
+    velocity_constraint: Any,
+    stabilization: Any,
+    auxiliary: Any,
 ) -> None:
-    _check_force(force, further)
-    if constraint is not None:
-        check_function("constraint", constraint, "phi(t, q, args)")
+    _check_force(force, auxiliary)
+    if position_constraint is not None:
+        check_function("position_constraint", position_constraint, "phi(t, q, args)")
     if velocity_constraint is not None:
         check_function("velocity_constraint", velocity_constraint, "a(t, q, v, args)")
-    if constraint is None and velocity_constraint is None:
+    if position_constraint is None and velocity_constraint is None:
         raise ValueError(
-            "`constraint` is None and there is no `velocity_constraint`: without constraints use "
+            "`position_constraint` is None and there is no `velocity_constraint`: without constraints use "
             "`diffrax.ODETerm` and the solver alone."
         )
     if not isinstance(stabilization, Baumgarte | VelocityStabilization | None):
@@ -238,21 +253,21 @@ def _check_arguments(
         )
 
 
-def _check_force(force: Any, further: Any) -> None:
-    call = "Q(t, q, v, args)" if further is None else "Q(t, q, v, z, args)"
+def _check_force(force: Any, auxiliary: Any) -> None:
+    call = "Q(t, q, v, args)" if auxiliary is None else "Q(t, q, v, z, args)"
     check_function("force", force, call)
 
 
-def _check_further(further: Any, further_constraint: Any) -> None:
-    if further is not None:
-        check_function("further", further, "h(t, q, v, z, args)")
-    elif further_constraint is not None:
+def _check_auxiliary(auxiliary: Any, auxiliary_constraint: Any) -> None:
+    if auxiliary is not None:
+        check_function("auxiliary", auxiliary, "h(t, q, v, z, args)")
+    elif auxiliary_constraint is not None:
         raise ValueError(
-            "`further_constraint` is for the states of `further`, which is None. Constraints on positions and "
-            "velocities are `constraint` and `velocity_constraint`."
+            "`auxiliary_constraint` is for the states of `auxiliary`, which is None. Constraints on positions and "
+            "velocities are `position_constraint` and `velocity_constraint`."
         )
-    if not isinstance(further_constraint, AbstractConstraint | None):
+    if not isinstance(auxiliary_constraint, AbstractConstraint | None):
         raise TypeError(
-            "`further_constraint` must be an `mj.Constraint` on z, or another one, got "
-            f"{type(further_constraint).__name__}. Write e.g. `mj.Constraint(lambda t, z, args: z @ z - 1.0)`."
+            "`auxiliary_constraint` must be an `mj.Constraint` on z, or another one, got "
+            f"{type(auxiliary_constraint).__name__}. Write e.g. `mj.Constraint(lambda t, z, args: z @ z - 1.0)`."
         )

@@ -22,7 +22,7 @@ from .load_groups import group_forces
 from .loads import AbstractLoads, add
 from .rotations import rates_matrix, turn_back
 from .start import make_state
-from .system import Itself, system_of
+from .system import ConstantAssembly, system_of
 
 
 class Assembly(eqx.Module):
@@ -91,7 +91,7 @@ class Assembly(eqx.Module):
     def system(self) -> MechanicalSystem:
         """Masses, constraints and forces as a [`MechanicalSystem`][], which has the `terms`, the
         manifold `constraint` and the `multipliers`."""
-        return system_of(Itself(self), self.redundant)
+        return system_of(ConstantAssembly(self), self.redundant)
 
     @property
     def names(self) -> tuple[str, ...]:

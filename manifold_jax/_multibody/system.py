@@ -11,7 +11,7 @@ from .._mechanics import AbstractPositions, MechanicalSystem
 from .bodies import Pose
 
 
-class Itself(eqx.Module):
+class ConstantAssembly(eqx.Module):
     assembly: Any
 
     def __call__(self, args: Args) -> Any:

@@ -49,7 +49,7 @@ class Linearized(NamedTuple):
 
     - `derivative`: `y'`.
     - `newton`: Newton's step towards consistency.
-    - `kept`: what changes of the state do to `newton` beside it, `A^-1 M change`.
+    - `kept`: what changes of the state do to `newton` off it, `A^-1 M change`.
     - `residual`: the largest of an algebraic equation, relative to what changes of the unknowns
       (`|x| + 1`) by all their digits do to it. Rounding of the state leaves a few units of it, where
       equations are badly conditioned far more of `newton`.

@@ -59,7 +59,7 @@ def diffeqsolve(
     """Solve a differential equation on a manifold.
 
     Takes the arguments of `diffrax.diffeqsolve` and returns its `Solution`. In addition the
-    initial value is made consistent, and every value handed out is on the manifold: saved
+    initial value is made consistent, and every value returned is on the manifold: saved
     values, the dense solution `sol.evaluate`, what `SaveAt(fn=...)` and event functions see,
     and the state at an event.
 
@@ -165,5 +165,5 @@ def diffeqsolve(
         solver_state=ready.solver_state if solver_state is None else solver_state,
         **options,
     )
-    # The dense solution, which is handed out, holds the constraint that was given.
+    # The dense solution, which is returned, holds the constraint that was given.
     return finish(sol, hook, given, saveat, event, ready.y0, args, ready.start, throw)

@@ -1,4 +1,4 @@
-"""Everything handed out between steps: saved values, user functions and events, on the manifold."""
+"""Everything returned between steps: saved values, user functions and events, on the manifold."""
 
 from collections.abc import Callable
 from typing import Any

@@ -13,7 +13,7 @@ from .._constraint.checks import check_constraint, check_state
 from .._rosenbrock import AbstractRosenbrock, MassMatrixTerm
 from .._solver.base import AbstractManifoldSolver, controller_tolerances
 from .._solver.step.advance import HookState
-from .._solver.step.execution import WrittenOut
+from .._solver.step.execution import ExplicitStep
 from .._solver.terms import DirectedTerm
 from .._solver.unconstrained import Unconstrained
 from .first_step import first_step, FirstStep
@@ -109,7 +109,7 @@ def _solver_state(
     t1 = t0 + first.size
     execution = solver.execution(terms, t0, t1, y0, args)
     rewritten = solver.prepare_terms(terms) is not terms
-    if rewritten or not isinstance(execution, WrittenOut):
+    if rewritten or not isinstance(execution, ExplicitStep):
         return None
     memory = first.field if execution.remembers_field else None
     return HookState.initial(memory, t0, t1, y0)

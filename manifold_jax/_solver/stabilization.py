@@ -76,7 +76,7 @@ class AbstractStabilization(eqx.Module):
 
     @property
     def ends_on_manifold(self) -> bool:
-        """Whether every step is to end on the manifold, with all that is handed out. Known while
+        """Whether every step is to end on the manifold, with all that is returned. Known while
         tracing."""
         return False
 
@@ -134,13 +134,13 @@ class InvariantStabilization(AbstractStabilization):
         # Of the whole state, whatever structure the constraint has: components are not moved apart.
         equations = _equations(constraint, t, y, args, projection)
         x, t = equations.x, equations.t
-        crossing = equations.crossing()
+        factored = equations.factored()
         rate = sign * self.gain * equations.residual(x)
         if self.projected:
             residual = lambda t, x: equations.function(t, x, equations.args)
             rate = rate + jax.jvp(residual, (t, x), (jnp.ones_like(t), w))[1]
-        undefined = jnp.where(crossing.factorization.full_rank, 0, jnp.nan).astype(w.dtype)
-        return unravel(w - combine(crossing.solve(rate), crossing.normals.directions) + undefined)
+        undefined = jnp.where(factored.factorization.full_rank, 0, jnp.nan).astype(w.dtype)
+        return unravel(w - combine(factored.solve(rate), factored.normals.directions) + undefined)
 
 
 class ExactStabilization(AbstractStabilization):
@@ -148,7 +148,7 @@ class ExactStabilization(AbstractStabilization):
 
     The distance from the manifold decays like `exp(-gain |t|)`, whatever `f` does outside,
     as `f(pi(y))` is tangent and `pi(y) - y` normal. With gain 0 it is `F = f(pi(y))` with the
-    end of every step projected: everything handed out is on the manifold.
+    end of every step projected: everything returned is on the manifold.
 
     **Arguments:**
 

@@ -23,7 +23,7 @@ class Stabilized(AbstractManifoldSolver):
     (constraint stabilization).
 
     Works forward and backward in time: violations decay in the direction of integration.
-    What is handed out is not corrected (except with `ExactStabilization(0)`): the violation
+    What is returned is not corrected (except with `ExactStabilization(0)`): the violation
     is of the size of the tolerance. Use [`Projected`][] for values on the manifold.
 
     **Arguments:**

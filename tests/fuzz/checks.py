@@ -1,4 +1,4 @@
-"""Checks of what a batch handed out, against NumPy and SciPy."""
+"""Checks of what a batch returned, against NumPy and SciPy."""
 
 import dataclasses
 from typing import Any
@@ -142,7 +142,7 @@ def check_other_lanes(found: Any, failed: Any) -> list[Fault]:
 def check_violations(
     structure: Structure, lanes: Lanes, judge: Judge, found: Any, failed: Any
 ) -> tuple[list[Fault], float]:
-    """Constraints at all values handed out; returns the largest violation, too."""
+    """Constraints at all values returned; returns the largest violation, too."""
     okay = is_okay(found["code"])
     which, k = _points(structure, found, okay)
     values = _violations_at(structure, lanes, found, which, k)

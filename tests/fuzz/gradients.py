@@ -105,7 +105,7 @@ def _raises_upstream(structure: Structure) -> bool:
 
 
 def _loss(structure: Structure, adjoint: Any, lane: Any) -> Any:
-    """A weighted sum of all values handed out, and whether the solve succeeded."""
+    """A weighted sum of all values returned, and whether the solve succeeded."""
     out = solve(structure, adjoint)(lane)
     used = jnp.isfinite(out["times"])[:, None]
     weights = jnp.cos(1 + jnp.arange(out["states"].shape[1]))

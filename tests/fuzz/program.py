@@ -32,7 +32,7 @@ CODES = (
 def solve(structure: Structure, adjoint: Any = None, throw: bool = False) -> Callable[[Any], Any]:
     """A function of a lane: `start`, `end`, `y0`, `args`.
 
-    It returns all `times` (k,) and `states` (k, n) that were handed out, the result `code` as an
+    It returns all `times` (k,) and `states` (k, n) that were returned, the result `code` as an
     index into `CODES`, and the numbers of steps.
     """
 
@@ -40,7 +40,7 @@ def solve(structure: Structure, adjoint: Any = None, throw: bool = False) -> Cal
         problem = Problem(structure, lane)
         function, terms, solver = problem.approach()
         controller, dt0 = _controller(structure, lane)
-        saveat, event, handed_out = _output(structure, lane)
+        saveat, event, saved_value = _output(structure, lane)
         sol = function(
             terms,
             solver,
@@ -56,7 +56,7 @@ def solve(structure: Structure, adjoint: Any = None, throw: bool = False) -> Cal
             adjoint=mj.StepReplayAdjoint() if adjoint is None else adjoint,
             throw=throw,
         )
-        times, states = handed_out(sol)
+        times, states = saved_value(sol)
         code = sum(
             (i + 1) * (sol.result == getattr(dfx.RESULTS, name)) for i, name in enumerate(CODES)
         )

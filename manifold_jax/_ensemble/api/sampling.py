@@ -18,7 +18,7 @@ class Samples(eqx.Module):
     t1: Any
     y0s: Any
     args: Any
-    in_axes: Any = eqx.field(static=True)
+    args_axes: Any = eqx.field(static=True)
 
 
 def drawn(sample: Callable, t0: Any, t1: Any, key: Array, index: Array) -> Samples:

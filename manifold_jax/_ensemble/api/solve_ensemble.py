@@ -12,7 +12,7 @@ from jax.sharding import Mesh
 from jaxtyping import Array
 
 from ..._adjoint import StepReplayAdjoint
-from ..._base.errors import clear_errors
+from ..._base.errors import clear_errors, refuse_old_names
 from ..._base.numbers import numbers_as_arrays
 from ..._base.types import Args, RealScalarLike, Y
 from ..._solve.arguments import check_arguments, fault_of_field, warn_of_rounding, without_idle_hook
@@ -34,6 +34,7 @@ from ..lanes.trajectory import Equations
 from .devices import check_mesh, over_devices
 
 
+@refuse_old_names(in_axes="args_axes")
 @clear_errors
 @checking_first_step
 @numbers_as_arrays("y0s", "args", times=("t0", "t1", "dt0"))
@@ -50,7 +51,7 @@ def solve_ensemble(
     saveat: dfx.SaveAt = dfx.SaveAt(t1=True),
     stepsize_controller: dfx.AbstractStepSizeController = dfx.ConstantStepSize(),
     max_steps: int = 4096,
-    in_axes: Any = 0,
+    args_axes: Any = None,
     lanes: int = 128,
     adjoint: dfx.AbstractAdjoint = StepReplayAdjoint(),
     mesh: Mesh | None = None,
@@ -60,7 +61,7 @@ def solve_ensemble(
     """Solve a differential equation on a manifold for many initial values and parameters.
 
     Each trajectory is that of [`diffeqsolve`][], to rounding: the same accepted steps, and on the
-    manifold at every value handed out. `lanes` of them advance together, with steps of their own; one
+    manifold at every value returned. `lanes` of them advance together, with steps of their own; one
     that has ended, or failed, makes room for the next at once, so that none waits for the
     longest. Every component of the state is a vector of lanes of its own, in which constants and
     structural zeros are folded before XLA sees them: four to eight times as fast as `jax.vmap` of
@@ -71,8 +72,8 @@ def solve_ensemble(
     - `y0s`: initial values, any pytree; the leading axis of each leaf is that of the `N`
         trajectories.
     - `t0`, `t1`: common to all, or of shape `(N,)`.
-    - `args`, `in_axes`: what of `args` each trajectory has of its own, as in `jax.vmap`: 0 for a
-        leading axis, `None` for what is common to all; a prefix of the tree of `args`.
+    - `args`, `args_axes`: what of `args` each trajectory has of its own: 0 for a leading axis, `None`
+        for what is common to all, by default everything; a prefix of the tree of `args`.
     - `saveat`: the end, `SaveAt(t1=True)`, the start, times (common to all), and functions of them.
     - `lanes`: how many trajectories advance together, on each device.
     - `adjoint`: the mode of differentiation: reverse, or `diffrax.ForwardMode()` for `jax.jvp` and
@@ -105,7 +106,7 @@ def solve_ensemble(
     if mesh is not None:
         check_mesh(mesh, solver)
     check_arguments(terms, solver, dt0, saveat, stepsize_controller, adjoint, None, consistent)
-    batch = checked_batch(t0, t1, dt0, y0s, args, in_axes, saveat, lanes)
+    batch = checked_batch(t0, t1, dt0, y0s, args, args_axes, saveat, lanes)
     if not isinstance(max_steps, int) or max_steps < 1:
         raise ValueError(f"`max_steps` must be a positive integer, got {max_steps!r}.")
     one = jax.eval_shape(batch.one)

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from ..._base.errors import clear_errors
+from ..._base.errors import clear_errors, refuse_old_names
 from ..._base.types import RealScalarLike
 from ..._solve.start import Consistent
 from ..lanes.solution import messages_of
@@ -40,11 +40,12 @@ from .solve_ensemble import solve_ensemble
 _LARGEST_SIZE = 2**31 - 1
 
 
+@refuse_old_names(out="path")
 @clear_errors
 def stream_ensemble(
     sample: Callable[[Array, Array], tuple[Any, Any]],
     size: int,
-    out: str | Path,
+    path: str | Path,
     terms: dfx.AbstractTerm,
     solver: dfx.AbstractSolver,
     t0: RealScalarLike | Callable[[Array, Array], Any],
@@ -89,14 +90,14 @@ def stream_ensemble(
         Traced and mapped over: write it with `jax.numpy`. It must depend on nothing else that changes.
         What it returns in `args` as it is, without computing it, is common to all.
     - `size`: the number of trajectories.
-    - `out`: the folder; made if it does not exist, and refused if it is not empty unless `resume`.
+    - `path`: the folder; made if it does not exist, and refused if it is not empty unless `resume`.
     - `terms`, `solver`, `dt0`, `saveat`, `stepsize_controller`, `max_steps`, `lanes`, `consistent`:
         as of [`solve_ensemble`][].
     - `t0`, `t1`: common to all, or functions `(index, key)` like `sample`.
     - `chunk`: how many trajectories are solved and written together. Much larger than `lanes`, as
         lanes run empty at the end of each chunk.
     - `seed`: of the random numbers.
-    - `resume`: continue what is in `out`, or begin if there is nothing. Chunks that are missing or
+    - `resume`: continue what is in `path`, or begin if there is nothing. Chunks that are missing or
         damaged are computed again. Refused if the settings stored there differ, `terms`, constraint
         and `sample` included, but for what a `jax.pure_callback` calls, which cannot be seen.
     - `progress`: show how far it is, trajectories per second, and how many have failed.
@@ -115,7 +116,7 @@ def stream_ensemble(
     zarr()
     size = _positive("size", size)
     chunk = min(_positive("chunk", chunk), size)
-    key, out = _key(seed), Path(out)
+    key, folder = _key(seed), Path(path)
     _check_functions(sample, t0, t1)
     parts = {"sample": sample, "terms": terms, "solver": solver, "t0": t0, "t1": t1, "dt0": dt0}
     options = {
@@ -131,10 +132,10 @@ def stream_ensemble(
     lowered = _solve_chunk.lower(*call(0))
     settings = {"size": size, "chunk": chunk, "seed": int(seed), **parts, **options}
     described = settings_of(settings, lowered.as_text()) | {"checksums": "crc32c"}
-    with clear_write_errors(out):
-        out.mkdir(parents=True, exist_ok=True)
-    with only_writer(out):
-        stored = _opened(out, described, messages_of(solver), examples, resume)
+    with clear_write_errors(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+    with only_writer(folder):
+        stored = _opened(folder, described, messages_of(solver), examples, resume)
         _compute(stored, lowered, call, progress)
     return stored
 
@@ -174,7 +175,7 @@ def _solve_chunk(
         parts["dt0"],
         samples.y0s,
         samples.args,
-        in_axes=samples.in_axes,
+        args_axes=samples.args_axes,
         **options,
     )
     return {

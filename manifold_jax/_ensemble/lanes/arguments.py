@@ -50,7 +50,7 @@ class Batch(eqx.Module):
 
 
 def checked_batch(
-    t0: Any, t1: Any, dt0: Any, y0s: Y, args: Args, in_axes: Any, saveat: dfx.SaveAt, lanes: int
+    t0: Any, t1: Any, dt0: Any, y0s: Y, args: Args, args_axes: Any, saveat: dfx.SaveAt, lanes: int
 ) -> Batch:
     """Refuse leading axes that do not fit, naming the argument."""
     if not isinstance(lanes, int) or lanes < 1:
@@ -63,12 +63,12 @@ def checked_batch(
     for name, t, own in zip(("t0", "t1"), (t0, t1), timed, strict=True):
         if own:
             sizes[name] = _size(t)
-    args_axes = _axes(in_axes, args)
-    for (path, x), own in zip(_leaves(args), jtu.tree_leaves(args_axes), strict=True):
+    axes_of_args = _axes(args_axes, args)
+    for (path, x), own in zip(_leaves(args), jtu.tree_leaves(axes_of_args), strict=True):
         if own:
             sizes[f"args{jtu.keystr(path)}"] = _size(x)
     _check_sizes(sizes)
-    mask = (*timed, which, args_axes)
+    mask = (*timed, which, axes_of_args)
     full = (t0, t1, y0s, args)
     each, common = eqx.filter(full, mask), eqx.filter(full, mask, inverse=True)
     times = [t if np.ndim(t) == 0 else t[0] for t in (t0, t1)]
@@ -128,17 +128,17 @@ def _size(x: Any) -> int | None:
     return x.shape[0] if eqx.is_array(x) and x.ndim > 0 else None
 
 
-def _axes(in_axes: Any, args: Args) -> Any:
+def _axes(args_axes: Any, args: Args) -> Any:
     """For each leaf of `args` whether it has a leading axis of trajectories."""
-    for axis in jtu.tree_leaves(in_axes):
+    for axis in jtu.tree_leaves(args_axes):
         if axis not in (0, None):
-            raise ValueError(f"`in_axes` must be 0 or None, or a tree of them, got {axis!r}.")
+            raise ValueError(f"`args_axes` must be 0 or None, or a tree of them, got {axis!r}.")
     own = lambda axis, part: jtu.tree_map(lambda _: axis is not None, part)
     try:
-        return jtu.tree_map(own, in_axes, args, is_leaf=lambda x: x is None)
+        return jtu.tree_map(own, args_axes, args, is_leaf=lambda x: x is None)
     except ValueError as error:
         raise ValueError(
-            "`in_axes` must be 0, None, or a tree of them of the upper structure of `args`."
+            "`args_axes` must be 0, None, or a tree of them of the upper structure of `args`."
         ) from error
 
 
@@ -147,12 +147,12 @@ def _check_sizes(sizes: dict[str, int | None]) -> None:
         if size is None:
             raise ValueError(
                 f"`{name}` is one number, but needs a leading axis, one entry for each trajectory. What is common to "
-                "all trajectories is marked by None in `in_axes`, e.g. `in_axes=None`."
+                "all trajectories is marked by None in `args_axes`, e.g. `args_axes=None`."
             )
     if len(set(sizes.values())) > 1:
         raise ValueError(
             f"Leading axes are the trajectories and must be equally long, got {sizes}. What is common to all "
-            "trajectories is marked by None in `in_axes`."
+            "trajectories is marked by None in `args_axes`, what each has of its own by 0."
         )
     if 0 in sizes.values():
         raise ValueError("`y0s` has no trajectories: its leading axis is empty.")

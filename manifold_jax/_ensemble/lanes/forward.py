@@ -96,9 +96,9 @@ class Tangents:
         info, tangent = dense_info
         return jax.jvp(interpolated, (info,), (tangent,))
 
-    def handed_out(self, given: Given, t: FloatScalar, y: Any) -> tuple[Any, BoolScalar]:
+    def saved_value(self, given: Given, t: FloatScalar, y: Any) -> tuple[Any, BoolScalar]:
         def value(equations, given, y):
-            value, success = equations.handed_out(given, t, y)
+            value, success = equations.saved_value(given, t, y)
             return eqx.filter(value, eqx.is_inexact_array), (value, success)
 
         _, tangent, (value, success) = self._along(value, given, *y)

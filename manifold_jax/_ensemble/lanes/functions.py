@@ -1,4 +1,4 @@
-"""What is done in each lane on the way back, as functions of one trajectory."""
+"""What is done in each lane in the reverse sweep, as functions of one trajectory."""
 
 from collections.abc import Callable
 from typing import Any
@@ -95,7 +95,7 @@ class Functions:
 
         def value(each: Any, common: Any, y: Any) -> Any:
             equations, given = self.parts.one(each, common, rest)
-            value, _ = equations.handed_out(given, t, y)
+            value, _ = equations.saved_value(given, t, y)
             return eqx.filter(value, eqx.is_inexact_array)
 
         return jax.vjp(value, each, common, y)[1](bar)

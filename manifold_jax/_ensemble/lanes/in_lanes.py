@@ -44,8 +44,8 @@ def gradient_in_lanes(
         new = run._replace(start=start, outcome=outcome, values=values)
         return eqx.filter(saved_rows(equations.saveat.subs, batch, new), eqx.is_inexact_array)
 
-    handed_out = run.start.trajectory.y, run.outcome.y, smooth_values
-    rows, pullback = jax.vjp(saved, parts.each, parts.common, *handed_out)
+    saved_value = run.start.trajectory.y, run.outcome.y, smooth_values
+    rows, pullback = jax.vjp(saved, parts.each, parts.common, *saved_value)
     bar = jtu.tree_map(lambda x, b: jnp.zeros_like(x) if b is None else b, rows, bar)
     each, common, *bars = pullback(bar)
     ends = Ends(run.start.trajectory, run.outcome.num_steps, run.rows, run.states, *bars)
@@ -57,7 +57,7 @@ def gradient_in_lanes(
 # Operations on one number, of a start and a step, beyond which trajectories are mapped over instead. A
 # double pendulum has 3389; the 16308 of a four-bar linkage take 72 s to compile, and half of the time.
 _LONGEST = 8_000
-# Of the way back, which has the step twice.
+# Of the reverse sweep, which has the step twice.
 _LONGEST_BACK = 5 * _LONGEST
 
 

@@ -42,7 +42,7 @@ def solve_mapped(inputs: Inputs, lanes: int) -> EnsembleSolution:
 
 
 def gradient_of_mapped(inputs: Inputs, differentiated: Any, bar: Any, lanes: int) -> Any:
-    """From the cotangents of times and values, each trajectory by the way back of `diffeqsolve`."""
+    """From the cotangents of times and values, each trajectory by the reverse sweep of `diffeqsolve`."""
     smooth, rest = eqx.partition(inputs, differentiated)
 
     def saved(smooth: Any) -> Any:

@@ -1,4 +1,4 @@
-"""What the way back of an ensemble begins with, carries along, and keeps of the way there."""
+"""What the reverse sweep of an ensemble begins with, carries along, and keeps of the forward one."""
 
 from typing import Any, NamedTuple
 

@@ -105,7 +105,7 @@ class WayBack:
             return (record, bars.common), bars.each
 
     def _through_values(self, group: Group, common: list[Array]) -> tuple[Group, Bars]:
-        """What is handed out at `ts`, time by time, to begin with."""
+        """What is returned at `ts`, time by time, to begin with."""
         index, last = group.index, taken(self.last_bar, group.index)
         zeros = [jnp.zeros(index.size, d) for d in self.smooth_layout.dtypes_of_columns()]
         none = [jnp.zeros_like(x) for x in group.each]
@@ -144,7 +144,7 @@ class WayBack:
                 num_rows, unfinished, state, record = self._forwards(group, state, record)
                 onwards = onwards & unfinished
                 bars = self._backwards(group, jnp.where(onwards, 0, num_rows), record, bars)
-                after = stacked(state)  # is not read again on the way back
+                after = stacked(state)  # is not read again in the reverse sweep
                 firsts = {d: x.at[k + 1].set(after[d], mode="drop") for d, x in firsts.items()}
                 return jnp.where(onwards, k + 1, k - 1), onwards, firsts, record, bars
 

@@ -51,7 +51,7 @@ class Totals(NamedTuple):
 class Run(NamedTuple):
     """All trajectories, in front of every array. How many of the times to save at each has reached; the
     states there, as they were interpolated (a table, in its rows the times of one trajectory after
-    those of the other), what was handed out, and whether some of it could not be corrected."""
+    those of the other), what was returned, and whether some of it could not be corrected."""
 
     start: Any  # `Start` and `Outcome`, or what the equations have in their place
     outcome: Any
@@ -138,7 +138,7 @@ class Schedule:
         return outcomes, Layout.of(self.equations.state_of(trajectory))
 
     def _layout_of_values(self, y_layout: Layout) -> Layout:
-        value = lambda given, t, y: self.equations.handed_out(self.complete(given), t, y)[0]
+        value = lambda given, t, y: self.equations.saved_value(self.complete(given), t, y)[0]
         given, y = self.given_layout.example(), y_layout.example()
         return Layout.of(jax.eval_shape(value, given, self.ts[0], y))
 
@@ -159,7 +159,7 @@ class Schedule:
                     t = Layout.of(self.ts[0]).values(
                         [jnp.broadcast_to(self.ts[row], reached.shape)]
                     )
-                    value, success = self._call(self.equations.handed_out, given, t, y)
+                    value, success = self._call(self.equations.saved_value, given, t, y)
                     failed |= reached & ~_column(success, self.lanes)
                     return failed, columns_of_values(value, self.lanes)
 

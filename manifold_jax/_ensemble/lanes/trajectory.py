@@ -174,7 +174,7 @@ class Equations(eqx.Module):
         """The state inside a step, as the solver interpolates it. Times increase."""
         return self.solver.interpolation_cls(t0=start, t1=end, **dense_info).evaluate(t)
 
-    def handed_out(self, given: Given, t: FloatScalar, y: Y) -> tuple[Any, BoolScalar]:
+    def saved_value(self, given: Given, t: FloatScalar, y: Y) -> tuple[Any, BoolScalar]:
         """What is saved of such a state, and whether it is on the manifold. `t` is the true time."""
         success = jnp.asarray(True)
         if self.solver.corrects_output:

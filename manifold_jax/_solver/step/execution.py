@@ -1,6 +1,6 @@
 """How a step of the wrapped solver is executed: the one place where that is chosen.
 
-- [`WrittenOut`][]: an explicit Runge-Kutta step, stage by stage or in a loop over the stages.
+- [`ExplicitStep`][]: an explicit Runge-Kutta step, stage by stage or in a loop over the stages.
 - [`CarriedDerivative`][]: Diffrax's own step of an implicit method, that begins with the derivative
   at which the step before ended.
 - [`OwnStep`][]: the solver's own step, whatever it is.
@@ -68,7 +68,7 @@ class AbstractExecution(eqx.Module):
         `frame.terms` those of the coordinates at stages."""
 
 
-class WrittenOut(AbstractExecution):
+class ExplicitStep(AbstractExecution):
     """An explicit step of this library, that corrects the new state before the last stage."""
 
     solver: dfx.AbstractSolver
@@ -145,7 +145,7 @@ def execution_of(
 ) -> AbstractExecution:
     """The fastest way that does the same."""
     if is_unrollable(solver, terms, t0, t1, y0, args):
-        return WrittenOut(solver)
+        return ExplicitStep(solver)
     if carries_derivative(solver, terms, t0, t1, y0, args):
         return CarriedDerivative(solver)
     return OwnStep(solver)

@@ -125,7 +125,7 @@ def comparison_notes(
     if stabilized:
         notes.append(
             f"Stabilization ({', '.join(stabilized)}) with gain {task.gain:.3g} per unit of time; "
-            "its states are handed out uncorrected."
+            "its states are returned uncorrected."
         )
     for method in left_out:
         notes.append(f"Left out: {method.key}, which {method.needs}.")

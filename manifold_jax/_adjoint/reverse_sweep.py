@@ -1,4 +1,4 @@
-"""The way back: the recorded steps in reverse order, each computed once more and transposed."""
+"""The reverse sweep: the recorded steps in reverse order, each computed once more and transposed."""
 
 from typing import Any, NamedTuple
 
@@ -32,7 +32,7 @@ class DenseBars(NamedTuple):
         return bar
 
 
-class Backwards(eqx.Module):
+class ReverseSweep(eqx.Module):
     """Transposed steps of a recorded solve."""
 
     functions: Functions

@@ -1,4 +1,4 @@
-"""Mechanical systems with further states: actuators, controllers, quadratures."""
+"""Mechanical systems with auxiliary states: actuators, controllers, quadratures."""
 
 import diffrax as dfx
 import jax
@@ -46,8 +46,8 @@ COMPASS = mj.Constraint(lambda t, z, args: z["compass"] @ z["compass"] - 1.0)
 
 
 def system(**options):
-    options = {"further_constraint": COMPASS, **options}
-    return mj.MechanicalSystem(1.0, rod, torque_and_weight, further=controller, **options)
+    options = {"auxiliary_constraint": COMPASS, **options}
+    return mj.MechanicalSystem(1.0, rod, torque_and_weight, auxiliary=controller, **options)
 
 
 def solve(built, hook, args=GAINS, t1=2.0, y0=START, **options):
@@ -112,7 +112,7 @@ def test_stabilized_accelerations(stabilization):
 def test_of_a_lagrangian_and_without_a_constraint_on_further_states():
     lagrangian = lambda t, q, v, args: v @ v / 2 - 9.81 * q[1]
     motor = lambda t, q, v, z, args: jnp.stack([-q[1], q[0]]) * z["motor"]
-    built = mj.MechanicalSystem.from_lagrangian(lagrangian, rod, motor, further=controller)
+    built = mj.MechanicalSystem.from_lagrangian(lagrangian, rod, motor, auxiliary=controller)
     sol = solve(built, mj.Projected(dfx.Tsit5(), built.constraint))
     expected = in_angles(np.asarray(sol.ts))
     np.testing.assert_allclose(sol.ys[2]["work"], expected[3], atol=2e-8)
@@ -156,22 +156,22 @@ def test_consistent_start():
 @pytest.mark.usefixtures("as_a_user_meets_it")
 def test_bad_arguments():
     with pytest.raises(TypeError, match=r"`force` must be a callable `Q\(t, q, v, z, args\)`"):
-        mj.MechanicalSystem(1.0, rod, lambda t, q, v, args: q, further=controller)
-    with pytest.raises(TypeError, match=r"`further` must be a callable `h\(t, q, v, z, args\)`"):
-        mj.MechanicalSystem(1.0, rod, torque_and_weight, further=lambda t, z: z)
-    with pytest.raises(TypeError, match="`further_constraint` must be an `mj.Constraint`"):
-        system(further_constraint=lambda t, z, args: z)
-    with pytest.raises(ValueError, match="`further_constraint` is for the states of `further`"):
-        mj.MechanicalSystem(1.0, rod, lambda t, q, v, args: q, further_constraint=COMPASS)
+        mj.MechanicalSystem(1.0, rod, lambda t, q, v, args: q, auxiliary=controller)
+    with pytest.raises(TypeError, match=r"`auxiliary` must be a callable `h\(t, q, v, z, args\)`"):
+        mj.MechanicalSystem(1.0, rod, torque_and_weight, auxiliary=lambda t, z: z)
+    with pytest.raises(TypeError, match="`auxiliary_constraint` must be an `mj.Constraint`"):
+        system(auxiliary_constraint=lambda t, z, args: z)
+    with pytest.raises(ValueError, match="`auxiliary_constraint` is for the states of `auxiliary`"):
+        mj.MechanicalSystem(1.0, rod, lambda t, q, v, args: q, auxiliary_constraint=COMPASS)
     built = system()
     with pytest.raises(
         ValueError, match=r"`y` must be the tuple `\(q, v, z\)`.*got shapes \(\(2,\), \(2,\)\)"
     ):
         solve(built, mj.Projected(dfx.Tsit5(), built.constraint), y0=START[:2])
     wrong = mj.MechanicalSystem(
-        1.0, rod, torque_and_weight, further=lambda t, q, v, z, args: z["motor"]
+        1.0, rod, torque_and_weight, auxiliary=lambda t, q, v, z, args: z["motor"]
     )
     with pytest.raises(
-        ValueError, match="`further` must return .* of the structure and shapes of z"
+        ValueError, match="`auxiliary` must return .* of the structure and shapes of z"
     ):
         solve(wrong, mj.Projected(dfx.Tsit5(), wrong.constraint))

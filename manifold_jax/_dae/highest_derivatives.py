@@ -60,7 +60,7 @@ class Static:
         self.plan = plan
 
 
-class Closing(AbstractEquations):
+class HighestDerivatives(AbstractEquations):
     """`F_i^(c_i) = 0` for the leading derivatives `w_j = x_j^(d_j)`, linear in them unless the form
     is implicit, at one state."""
 
