@@ -123,7 +123,7 @@ def unbroken(
 ) -> tuple[IntScalar, BoolScalar]:
     """How many nodes belong to one smooth curve, and whether that is all of them.
 
-    Near a factored the steps become as small as the tolerances allow, and the next one may
+    Near a crossing the steps become as small as the tolerances allow, and the next one may
     end on any of the branches: with the tangent reversed or turned.
     """
     used = jnp.isfinite(nodes.s)
