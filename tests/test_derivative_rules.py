@@ -184,8 +184,23 @@ WHERE = {"alone": alone, "in scan": in_scan, "in a batch": in_batch}
 AT = jnp.asarray(1.05)
 
 
-@pytest.mark.parametrize("where", variants(WHERE, ["in scan"]))
-@pytest.mark.parametrize("rule", RULES)
+# Rules whose programs take seconds to compile.
+LARGE = {
+    "start of index 1",
+    "start of a reduced DAE",
+    "start with a mass matrix",
+    "mechanical correction",
+    "redundant correction",
+}
+# In a scan, where JAX loses most, and in turn alone or in a batch.
+PAIRS = [(rule, "in scan") for rule in RULES]
+PAIRS += [(rule, ("alone", "in a batch")[i % 2]) for i, rule in enumerate(RULES)]
+
+
+@pytest.mark.parametrize(
+    ("rule", "where"),
+    variants(PAIRS, lambda pair: pair[1] == "in scan" and pair[0] not in LARGE),
+)
 def test_every_rule(rule, where):
     assert check(WHERE[where](RULES[rule]), AT) > 1e-6
 
@@ -196,7 +211,9 @@ def test_every_rule_in_a_while_loop(rule):
     check(in_while_loop(RULES[rule]), AT, reverse=False)
 
 
-@pytest.mark.parametrize("rule", ["root of a step", "inverse", "reduced DAE", "pseudo-inverse"])
+@pytest.mark.parametrize(
+    "rule", variants(["root of a step", "inverse", "reduced DAE", "pseudo-inverse"], ["inverse"])
+)
 def test_rules_that_are_not_compiled(rule):
     check(RULES[rule], AT, compiled=False)
 
@@ -259,7 +276,7 @@ def end_of(name, adjoint=None):
     return end
 
 
-@pytest.mark.parametrize("name", variants(SOLVES, ["mechanism", "reduced"]))
+@pytest.mark.parametrize("name", variants(SOLVES, ["mechanism"]))
 def test_solves(name):
     """Both modes of the default adjoint, and forward mode of both."""
     end = end_of(name)
@@ -270,6 +287,7 @@ def test_solves(name):
         np.testing.assert_allclose(jax.jit(derivative)(AT), bend, rtol=1e-7, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_reverse_over_reverse_of_a_solve():
     """With outputs between the steps."""
     end = end_of("projected", dfx.DirectAdjoint())

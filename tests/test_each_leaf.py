@@ -103,7 +103,7 @@ BODIES = dict(length=1.1, mass=1.3, inertia=0.2, stiffness=3.0, spring_length=0.
 BODIES |= dict(push=jnp.array([0.3, 0.2]), torque=0.8, gravity=9.81)
 
 
-@pytest.mark.parametrize("count", [2, 5])
+@pytest.mark.parametrize("count", [2, pytest.param(5, marks=pytest.mark.slow)])
 def test_bodies(count):
     """Four equations and ten: dense systems of more than eight are solved in another way."""
     angles = jnp.linspace(0.3, 1.2, count)

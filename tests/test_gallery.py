@@ -42,10 +42,16 @@ MECHANISMS = [
     "rolling-disc",
 ]
 FIRST = [name for name in mj.problems.ALL if name not in MECHANISMS]
-# By default every problem with one solver and the problem from outside with all of them.
-EVERY = [(name, solver) for name in [*FIRST, "outside"] for solver in SOLVERS]
-EVERY += [(name, solver) for name in MECHANISMS for solver in ("bosh3", "tsit5", "dopri8")]
-DEFAULT = {"accurate": {"tsit5"}, "other": set()}
+EVERY = [("outside", solver) for solver in SOLVERS]
+# Each problem with one solver and with another in turn, so that each solver meets several problems.
+for names, others in (
+    (FIRST, ("bosh3", "dopri5", "dopri8", "kvaerno5")),
+    (MECHANISMS, ("bosh3", "dopri8")),
+):
+    for i, name in enumerate(names):
+        EVERY += [(name, "tsit5"), (name, others[i % len(others)])]
+# By default the problem from outside with all of them, and one of each kind of problem.
+KINDS = {"pendulum", "rigid-body", "kepler", "sphere-flow", "skate", "four-bar", "heavy-top"}
 
 
 def cases(kind):
@@ -55,16 +61,20 @@ def cases(kind):
         pytest.param(
             name,
             solver,
-            marks=()
-            if solver in DEFAULT[kind] or name == "outside" or (name, solver) in ALSO
-            else pytest.mark.slow,
+            marks=() if _is_default(kind, name, solver) else pytest.mark.slow,
         )
         for name, solver in EVERY
-        if kind == "accurate" or solver == "tsit5" or name == "outside" or (name, solver) in ALSO
+        if kind == "accurate" or solver == "tsit5" or (name, solver) in ALSO
     ]
 
 
-ALSO = {("car-axis", "kvaerno5"), ("pendulum", "tsit5"), ("car-axis", "tsit5")}
+def _is_default(kind, name, solver):
+    if kind == "accurate":
+        return name == "outside" or (name in KINDS and solver == "tsit5")
+    return name == "outside" or (name, solver) in ALSO
+
+
+ALSO = {("outside", "kvaerno5"), ("pendulum", "tsit5")}
 
 
 class Case:

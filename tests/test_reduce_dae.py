@@ -130,6 +130,7 @@ def test_trajectories(reduced, name):
         np.testing.assert_allclose(residual, 0, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_gradients_alone_and_in_a_batch(reduced):
     """Of a position with respect to all parameters, which enter the start, too."""
     dae = reduced("pendulum")

@@ -129,6 +129,7 @@ def arm(structure, masses="blocks"):
     return mj.MechanicalSystem(M, joints, force, velocity_constraint=slip, structure=structure)
 
 
+@pytest.mark.slow
 def test_blocks_of_masses_and_constraints_on_velocities():
     y = (0.3 * jnp.cos(jnp.arange(12.0) ** 2), 0.2 * jnp.sin(jnp.arange(12.0)))
     args = jnp.asarray(0.4)

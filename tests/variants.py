@@ -12,4 +12,5 @@ def variants(every: Iterable[Any], default: Callable[[Any], bool] | Iterable[Any
     if not callable(default):
         names = tuple(default)
         default = lambda variant: variant in names
-    return [v if default(v) else pytest.param(v, marks=pytest.mark.slow) for v in every]
+    values = lambda variant: variant if isinstance(variant, tuple) else (variant,)
+    return [v if default(v) else pytest.param(*values(v), marks=pytest.mark.slow) for v in every]

@@ -120,7 +120,7 @@ def programs(case: Case, lanes: int, tolerance: float) -> dict[str, Callable]:
         )
         return sol.ys, sol.stats["num_steps"]
 
-    return {OURS: ours, THEIRS: jax.vmap(one, in_axes=(0, case.in_axes))}
+    return {OURS: ours, THEIRS: jax.vmap(one, in_axes=(0, case.args_axes))}
 
 
 def measure(
