@@ -109,3 +109,43 @@ def test_a_function_of_a_saved_value_that_cannot_be_corrected():
 
 def nowhere_between_steps(t, y, args):
     return y @ y - 1.0 + jnp.where((t > 0.245) & (t < 0.255), 5.0, 0.0)
+
+
+def test_an_event_in_the_other_direction_is_passed():
+    """The second component rises through sin(0.5) at 0.5, and falls through it at pi - 0.5."""
+    cond = lambda t, y, args, **kwargs: y[1] - np.sin(0.5)
+    ends = [
+        mj.diffeqsolve(
+            ROTATION,
+            mj.Projected(dfx.Tsit5(), CIRCLE),
+            0.0,
+            3.0,
+            0.05,
+            START,
+            event=dfx.Event(cond, FINDER, direction),
+        ).ts[0]
+        for direction in (True, False)
+    ]
+    np.testing.assert_allclose(ends, [0.5, np.pi - 0.5], atol=1e-6)
+
+
+def test_directions_of_two_events_in_one_step():
+    """The second happens earlier: it rises, as is asked for, or is passed where falling is."""
+
+    def end(directions):
+        conds = [
+            lambda t, y, args, **kwargs: y[0] - 0.9,
+            lambda t, y, args, **kwargs: y[1] - 0.3,
+        ]
+        return mj.diffeqsolve(
+            ROTATION,
+            mj.Projected(dfx.Tsit5(), CIRCLE),
+            0.0,
+            3.0,
+            0.7,
+            START,
+            event=dfx.Event(conds, FINDER, directions),
+        ).ts[0]
+
+    np.testing.assert_allclose(end([False, True]), np.arcsin(0.3), atol=1e-3)
+    np.testing.assert_allclose(end([False, False]), np.arccos(0.9), atol=1e-3)

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import manifold_jax as mj
+from manifold_jax._solver.interpolation import CorrectedInterpolation
 from manifold_jax._solver.step.execution import (
     CarriedDerivative,
     execution_of,
@@ -98,3 +99,18 @@ def test_implicit_steps(solver, jump):
 def test_what_has_no_other_way_makes_its_own_step():
     for solver in (dfx.HalfSolver(dfx.Heun()), dfx.ImplicitEuler(), dfx.EulerHeun()):
         assert isinstance(execution_of(solver, TERM, T0, T1, START, SPEED), OwnStep)
+
+
+def test_a_bent_interpolant_keeps_its_slopes_at_the_ends():
+    """`inner(t) + s^2 (3 - 2 s) correction`: from the old state to the corrected one."""
+    inner = dfx.LocalLinearInterpolation(
+        t0=jnp.asarray(1.0), t1=jnp.asarray(3.0), y0=jnp.array([0.0]), y1=jnp.array([4.0])
+    )
+    bent = CorrectedInterpolation(
+        t0=inner.t0, t1=inner.t1, inner=inner, y1=jnp.array([4.5]), correction=jnp.array([0.5])
+    )
+    value, slope = jax.vmap(lambda t: jax.jvp(bent.evaluate, (t,), (jnp.ones(()),)))(
+        jnp.array([1.0, 1.5, 3.0])
+    )
+    np.testing.assert_allclose(value[:, 0], [0.0, 1.0 + 0.5 * 0.15625, 4.5], atol=1e-15)
+    np.testing.assert_allclose(slope[:, 0], [2.0, 2.0 + 0.5 * 1.125 / 2, 2.0], atol=1e-14)

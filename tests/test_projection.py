@@ -82,6 +82,15 @@ def test_far_points(scale):
     np.testing.assert_allclose(info.correction, np.max(np.abs(p - y) / (np.abs(y) + 1)))
 
 
+def test_a_correction_of_a_step_takes_two_iterations():
+    """From as far as steps end: the factorization at that point leaves the square of the distance."""
+    point = jnp.array([0.6, 0.8]) + jnp.array([3e-5, -2e-5])
+    info = CIRCLE.correct(mj.NewtonProjection(), 0.0, point)[1]
+    assert info.iterations <= 3
+    closer = CIRCLE.correct(mj.NewtonProjection(), 0.0, jnp.array([0.6, 0.8]) * (1 + 1e-8))[1]
+    assert closer.iterations <= 2
+
+
 def test_weights_move_the_light_components():
     constraint = mj.Constraint(lambda t, y, args: y[0] + y[1] - 1.0)
     projection = mj.NewtonProjection(metric=jnp.array([1e6, 1.0]))

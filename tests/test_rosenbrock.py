@@ -33,6 +33,20 @@ def terms_of(problem):
 # --- orders ---------------------------------------------------------------------------------------
 
 
+@each_method
+def test_coefficients_belong_together(name):
+    """The table has `a = alpha Gamma^-1` and `C = diag(1/gamma) - Gamma^-1`; `c` and `d` are the sums of
+    the rows of alpha and Gamma (Hairer & Wanner, Solving ODEs II, IV.7.25)."""
+    tableau = METHODS[name].tableau
+    stages_ = len(tableau.c)
+    a, C = np.zeros((stages_, stages_)), np.zeros((stages_, stages_))
+    for i in range(1, stages_):
+        a[i, :i], C[i, :i] = tableau.a_lower[i - 1], tableau.c_lower[i - 1]
+    Gamma = np.linalg.inv(np.eye(stages_) / tableau.gamma - C)
+    np.testing.assert_allclose((a @ Gamma).sum(axis=1), tableau.c, rtol=0, atol=1e-13)
+    np.testing.assert_allclose(Gamma.sum(axis=1), tableau.d, rtol=0, atol=1e-13)
+
+
 def forced(t, y, args):
     a, b = y
     return jnp.stack([-b * a + jnp.cos(t) * b + t**2, a**2 - jnp.sin(t) * b])

@@ -4,7 +4,8 @@
 
 Projected Tsit5, rtol = atol = 1e-8, the first steps of a folded chain, with constraints as sparse and
 as dense matrices, on one core. Beside them SciPy's DOP853 with banded solves and without corrections,
-MuJoCo (if installed) with its RK4, angles as coordinates and a constant step, and one solve of the whole system for accelerations and multipliers by KLU (`klujax`, if installed).
+MuJoCo (if installed) with its RK4, angles as coordinates and a constant step, and one solve of the
+whole system for accelerations and multipliers by KLU (`klujax`, if installed).
 """
 
 import time

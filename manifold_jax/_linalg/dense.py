@@ -156,7 +156,8 @@ class PseudoInverse(eqx.Module):
 def factorize(A: Float[Array, "m m"], redundant: bool = False) -> Factorization | PseudoInverse:
     """Factor `A`, symmetric positive semidefinite if `redundant`.
 
-    The rank counts as full when every pivot exceeds `10 m eps` times its diagonal entry: for a Gram matrix `A = G W^-1 G^T` that ratio is the squared sine of the angle between
+    The rank counts as full when every pivot exceeds `10 m eps` times its diagonal entry: for a
+    Gram matrix `A = G W^-1 G^T` that ratio is the squared sine of the angle between
     one row of `G` and the span of those before it, and rounding leaves about `eps` of it.
     """
     if redundant:

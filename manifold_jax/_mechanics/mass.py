@@ -119,7 +119,8 @@ def mass_values(mass_matrix: Any, q: Y) -> Float[Array, "..."] | InvertedBlocks:
             return jfu.ravel_pytree(jtu.tree_map(spread, mass_matrix, q))[0]
     raise ValueError(
         f"`mass_matrix` must be a scalar, a diagonal of shape ({n},) or of the shapes of q, a matrix of shape ({n}, "
-        f"{n}), or the blocks on its diagonal, of shape (bodies, d, d), for q of {n} numbers of shapes {jtu.tree_map(jnp.shape, q)}, got {shapes}. Masses of points whose "
+        f"{n}), or the blocks on its diagonal, of shape (bodies, d, d), for q of {n} numbers of "
+        f"shapes {jtu.tree_map(jnp.shape, q)}, got {shapes}. Masses of points whose "
         "positions are the rows of q: `jnp.broadcast_to(masses[:, None], q.shape)`."
     )
 
