@@ -85,7 +85,7 @@ class _EventsInStep:
         return times[i], jnp.arange(len(self.events)) == i, result
 
     def _state(self, t: FloatScalar) -> tuple[Y, BoolScalar | bool]:
-        """On the manifold, and whether it could be moved there."""
+        """Return the state on the manifold, and whether it could be moved there."""
         solver, y = self.given["solver"], self.interpolation.evaluate(t)
         if not (isinstance(solver, AbstractManifoldSolver) and solver.corrects_output):
             return y, True
@@ -94,7 +94,8 @@ class _EventsInStep:
         return y, info.success
 
     def _values(self, t: FloatScalar) -> Float[Array, " events"]:
-        """Of a condition that is true or false: how long it is until the end of the step."""
+        """Return the values of the event functions; of a condition that is true or false: how long
+        it is until the end of the step."""
         y, _ = self._state(t)
 
         def value(event, after):

@@ -33,7 +33,8 @@ class Step(NamedTuple):
 
 
 class TimesBar(NamedTuple):
-    """With respect to the ends of the solve and to the times of `SaveAt(ts=...)`. The ends of all
+    """Cotangents with respect to the ends of the solve and to the times of `SaveAt(ts=...)`. The
+    ends of all
     other steps are what they are."""
 
     t0: FloatScalar
@@ -42,7 +43,8 @@ class TimesBar(NamedTuple):
 
 
 class Gradient(NamedTuple):
-    """With respect to the state behind accepted step `number`, to the leaves of the functions and
+    """Cotangents with respect to the state behind accepted step `number`, to the leaves of the
+    functions and
     to times so far; `rows` are the last rows of each saving still to come."""
 
     number: IntScalar

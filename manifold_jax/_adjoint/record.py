@@ -116,7 +116,7 @@ class Record(eqx.Module):
         return self.times.shape[2] == 3
 
     def including(self, i: IntScalar, row: Float[Array, " columns"], x: Vectors) -> "Record":
-        """With step number `i`, made from `x`."""
+        """Return the record with step number `i`, made from `x`."""
         sizes = self.sizes
         block, within = i // sizes.block, i % sizes.block
         segment, begins = block // sizes.segment, (block % sizes.segment == 0) & (within == 0)

@@ -118,7 +118,7 @@ class Solve(NamedTuple):
 
 
 def memory_of(solver_state: Any) -> Any:
-    """Of a hook without its statistics, which no step depends on."""
+    """Return the memory of a hook without its statistics, which no step depends on."""
     return solver_state.memory if isinstance(solver_state, HookState) else solver_state
 
 

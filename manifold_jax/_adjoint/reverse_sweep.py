@@ -43,7 +43,7 @@ class ReverseSweep(eqx.Module):
     dense: DenseBars
 
     def run(self, last_bar: State, timed: bool) -> Gradient:
-        """From the cotangent of the last state."""
+        """Return the gradient from the cotangent of the last state."""
         gradient = Gradient(
             self.ends.num_accepted,
             [rows.count - 1 for rows in self.saved.rows],

@@ -241,7 +241,8 @@ def _gradient(differentiable, perturbed, values, bars):
 
 
 def _rows(replay: Replay, counts: list[Any], bar: SolveOutputs, ends: Ends) -> list[Rows]:
-    """Of each saving, with the cotangents of its values; `counts` are times and how many of those
+    """Return the saved rows of each saving, with the cotangents of its values; `counts` are times
+    and how many of those
     that were asked for were reached."""
     rows = []
     each = zip(replay.savings, counts, bar.ts, bar.ys, strict=True)

@@ -175,7 +175,8 @@ class Differentiable(NamedTuple):
 
 
 def scan_counts(equation: Any) -> tuple[int, int]:
-    """Of a traced `lax.scan`, how many of its inputs are constants and how many are carried. JAX 0.12 has no
+    """Return, of a traced `lax.scan`, how many of its inputs are constants and how many are
+    carried. JAX 0.12 has no
     parameters that say so; what is scanned over has one axis less in the body."""
     body = getattr(equation.params["jaxpr"], "jaxpr", equation.params["jaxpr"])
     scanned = lambda outer, inner: sum(

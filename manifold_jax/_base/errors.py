@@ -13,7 +13,7 @@ Function = TypeVar("Function", bound=Callable)
 
 
 def clear_errors(function: Function) -> Function:
-    """Around a function made by `equinox.filter_jit`: the message of an error comes last, where it
+    """Wrap a function made by `equinox.filter_jit`: the message of an error comes last, where it
     is looked for, a call with the wrong arguments is told the right ones, and an ensemble that is
     differentiated forwards what to write for that."""
     signature, name = inspect.signature(function), getattr(function, "__name__", "")
@@ -45,7 +45,7 @@ def _is_reverse(parameters: Any, kwargs: Any) -> bool:
 
 
 def _message_last(text: str) -> str:
-    """Without the advice on debugging that Equinox puts behind the message."""
+    """Return the message without the advice on debugging that Equinox puts behind the message."""
     stack, found, rest = text.rpartition("equinox.EquinoxRuntimeError: ")
     message, _, _ = rest.partition("\n-------------------\n")
     return f"{stack}\n{message.strip()}" if found else text

@@ -5,7 +5,7 @@ from typing import Any
 
 
 class NoBar:
-    """In place of a bar, where lines are printed or nothing is."""
+    """A stand-in for a bar, where lines are printed or nothing is."""
 
     def add_task(self, *_: Any, **__: Any) -> int:
         return 0

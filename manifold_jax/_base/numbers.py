@@ -16,7 +16,7 @@ Function = TypeVar("Function", bound=Callable)
 
 
 def numbers_as_arrays(*names: str, times: tuple[str, ...] = ()) -> Callable[[Function], Function]:
-    """Around a function made by `equinox.filter_jit`, for which every other number is another
+    """Wrap a function made by `equinox.filter_jit`, for which every other number is another
     program: those in the arguments with these names become arrays, weakly typed as Python's numbers
     are. Whole numbers, which may be shapes or exponents, stay what they are, but for `times`."""
 

@@ -98,7 +98,8 @@ class AbstractConstraint(eqx.Module):
         return equations_of(self, t, y, args, projection, self.redundant).normals()
 
     def structure_at(self, t: RealScalarLike, y: Y, args: Args = None) -> Structure | None:
-        """Of `G = dg/dy`, if it is not to be held as an array: for many equations of few unknowns
+        """Return the sparsity structure of `G = dg/dy`, if it is not to be held as an array: for
+        many equations of few unknowns
         each. Known while tracing."""
         del t, y, args
         return None

@@ -96,7 +96,7 @@ class CorrectionEquations(AbstractEquations):
         return FactoredGram.of(ConstraintNormals(G, at_start.directions), self.redundant, dependent)
 
     def factored(self) -> FactoredGram:
-        """At the point that is corrected."""
+        """Factor the Gram matrix at the point that is corrected."""
         normals = self.normals()
         # Equations that depend on each other on the manifold do so off it up to the distance.
         dependent = _dependent(1e6 * self.level(normals) ** 2) if self.redundant else 0.0

@@ -35,7 +35,7 @@ class ProjectionInfo(eqx.Module):
     success: BoolScalar
 
     def __repr__(self) -> str:
-        """With numbers where they are known, that is not while tracing."""
+        """Show numbers where they are known, that is not while tracing."""
         values = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
         if not all(_is_known(value) for value in values.values()):
             return eqx.tree_pformat(self)
@@ -44,7 +44,7 @@ class ProjectionInfo(eqx.Module):
 
     @staticmethod
     def of_nothing(y: Y, success: BoolScalar) -> "ProjectionInfo":
-        """For a state that has been left as it was."""
+        """Describe a state that has been left as it was."""
         dtype = jnp.result_type(*jtu.tree_leaves(y))
         zero = jnp.zeros((), dtype)
         none = jnp.zeros((0,), dtype)
@@ -54,7 +54,8 @@ class ProjectionInfo(eqx.Module):
 
     @staticmethod
     def of_formula(y: Y, p: Y, residual: FloatScalar, success: BoolScalar) -> "ProjectionInfo":
-        """For a constraint that corrects itself by a formula: no iterations and no multipliers.
+        """Describe the correction by a constraint that corrects itself by a formula: no iterations
+        and no multipliers.
         `residual` is the scaled residual at the point `p` to which `y` was moved."""
 
         def distance(a: Array, b: Array) -> FloatScalar:
@@ -68,7 +69,7 @@ class ProjectionInfo(eqx.Module):
 
     @staticmethod
     def of_parts(*parts: "ProjectionInfo") -> "ProjectionInfo":
-        """For a state whose parts have been corrected one by one."""
+        """Describe a state whose parts have been corrected one by one."""
         joined = lambda combine, name: functools.reduce(combine, [getattr(p, name) for p in parts])
         return ProjectionInfo(
             multipliers=jnp.concatenate([part.multipliers for part in parts]),
@@ -81,7 +82,7 @@ class ProjectionInfo(eqx.Module):
 
     @staticmethod
     def of_correction(x: Float[Array, " n"], *roots: CorrectionRoot) -> "ProjectionInfo":
-        """For `x`, whose parts have been moved to those roots."""
+        """Describe the correction of `x`, whose parts have been moved to those roots."""
         moved = jnp.concatenate([root.p for root in roots]) - x
         correction = jnp.max(jnp.abs(moved) / (jnp.abs(x) + 1))
         return ProjectionInfo(

@@ -53,7 +53,8 @@ class Aliases(NamedTuple):
         return Aliases(root, shift, factor, np.array(used, int))
 
     def merged(self, there: np.ndarray) -> np.ndarray:
-        """Of an array `(equations, derivatives, unknowns)` of bools: that of the equations and
+        """Return, of an array `(equations, derivatives, unknowns)` of bools: that of the equations
+        and
         unknowns that are left."""
         n, levels = there.shape[1:][::-1]
         out = np.zeros((n, levels + int(self.shift.max(initial=0)), n), bool)
@@ -111,7 +112,8 @@ def lifted(equations: Equations, aliases: Aliases, structure: Structure, point: 
 def _nonlinear(
     equations: Equations, aliases: Aliases, structure: Structure, point: Point
 ) -> np.ndarray:
-    """Of the leading derivatives, in equations that are not differentiated."""
+    """Return which of the leading derivatives occur nonlinearly in equations that are not
+    differentiated."""
     compact = np.searchsorted(aliases.roots, aliases.root)
     levels = structure.d[compact] - aliases.shift
     (unknowns,) = np.nonzero((levels >= 0) & (levels <= equations.order))

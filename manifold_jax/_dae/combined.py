@@ -46,7 +46,8 @@ def cancelled(
     matrices: list[np.ndarray],
     point: Point,
 ) -> list[Cancelled]:
-    """Of equations that are differentiated equally often: those that hold for other parameters and
+    """Return the cancellations among equations that are differentiated equally often: those that
+    hold for other parameters and
     times, too, and of which none changes an equation that another one needs."""
     jacobians = _jacobians(equations, occurrence.there, point)
     found: list[Cancelled] = []
@@ -109,7 +110,8 @@ def _vanishes(jacobians: list[np.ndarray], rows: np.ndarray, weights: np.ndarray
 
 
 def _common_null_vectors(matrices: list[np.ndarray]) -> list[np.ndarray]:
-    """With few numbers that are not zero, the first positive, the largest of them 1. Columns of each matrix are scaled
+    """Return the common null vectors with few numbers that are not zero, the first positive, the
+    largest of them 1. Columns of each matrix are scaled
     for themselves: exponential functions differ by many decades from sample to sample."""
     every = np.concatenate(matrices, axis=1)
     scale = np.ones(len(every))
@@ -136,7 +138,8 @@ def _common_null_vectors(matrices: list[np.ndarray]) -> list[np.ndarray]:
 
 
 def _jacobians(equations: Equations, there: np.ndarray, point: Point) -> list[np.ndarray]:
-    """By all derivatives, `(n, levels, n)`, at other times, values and parameters."""
+    """Return the Jacobians with respect to all derivatives, `(n, levels, n)`, at other times,
+    values and parameters."""
 
     @jax.jit
     def jacobian(t: Array, jets: tuple[Array, ...], args: object) -> Array:

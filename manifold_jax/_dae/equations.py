@@ -26,7 +26,7 @@ def number_names(tree: Any, alone: str) -> list[str]:
 
 
 def leaf_names(tree: Any, alone: str) -> list[tuple[str, list[str]]]:
-    """Of each leaf, and of the numbers in it."""
+    """Return the names of each leaf, and of the numbers in it."""
     found = []
     for path, leaf in jax.tree_util.tree_leaves_with_path(tree):
         name = jax.tree_util.keystr(path, simple=True, separator=".") or alone
@@ -38,7 +38,7 @@ def leaf_names(tree: Any, alone: str) -> list[tuple[str, list[str]]]:
 
 
 def listed(names: list[str], most: int = 8) -> str:
-    """For messages."""
+    """List names in a message."""
     text = ", ".join(f"`{name}`" for name in names[:most])
     return text if len(names) <= most else f"{text} and {len(names) - most} more"
 
@@ -73,7 +73,7 @@ class Equations(eqx.Module):
         return jtu.tree_unflatten(structure, parts)
 
     def __call__(self, t: Array, jets: tuple[Array, ...], args: Args) -> Float[Array, " n"]:
-        """At the vectors `(x, x', ...)`."""
+        """Evaluate the equations at the vectors `(x, x', ...)`."""
         residual = self.function(t, *(self.unravel(x) for x in jets[: self.order + 1]), args)
         values = jfu.ravel_pytree(residual)[0].astype(jets[0].dtype)
         for row, parts in self.combinations:
@@ -102,7 +102,7 @@ class Equations(eqx.Module):
 
 
 class Names(NamedTuple):
-    """Of the numbers that `F` returns and of those of `x`."""
+    """The names of the numbers that `F` returns and of those of `x`."""
 
     equations: tuple[str, ...]
     unknowns: tuple[str, ...]

@@ -37,7 +37,8 @@ class Plan(NamedTuple):
     def jets_of_states(
         self, z: Float[Array, " a"], w: Float[Array, " n"] | None, differentiations: int
     ) -> tuple[Array, ...]:
-        """For equations of states alone. The others, evaluated with them, have to stay finite, and
+        """Return the derivatives for equations of states alone. The others, evaluated with them,
+        have to stay finite, and
         of moderate size where they cancel: for unknowns that are not states those in `w` are
         taken, without derivatives, or the example."""
         x, *others = self.jets(z, None, differentiations)

@@ -184,7 +184,7 @@ def _explain(
     info: ProjectionInfo,
     regular: BoolScalar,
 ) -> None:
-    """With numbers at hand, say which equations are singular."""
+    """Where numbers are known, say which equations are singular."""
     if any(isinstance(x, jax.core.Tracer) for x in jtu.tree_leaves((t, z, args, info))):
         return
     if bool(info.success) or (guess.fixed.any() and bool(regular)):

@@ -28,7 +28,8 @@ class Gather(NamedTuple):
 
 
 class Layout(NamedTuple):
-    """Of the state `z`: for each number the derivative and the unknown under whose name it goes
+    """The layout of the state `z`: for each number the derivative and the unknown under whose name
+    it goes
     (`names`), and for each that is left of the unknowns the place of its derivatives below `d_j`
     (`places[m, j]`, then that of `x_j^(d_j)` in the leading derivatives `w`, behind `z`)."""
 
@@ -42,7 +43,8 @@ class Layout(NamedTuple):
         return len(self.names)
 
     def leading_names(self) -> np.ndarray:
-        """Of the leading derivatives, each under the name with the fewest derivatives."""
+        """Return the names of the leading derivatives, each under the name with the fewest
+        derivatives."""
         found = []
         for j, root in enumerate(self.aliases.roots.tolist()):
             order = self.structure.d[j] - self.aliases.shift

@@ -68,7 +68,7 @@ def _stationarity(g: Constrained, guess: Array, x: Float[Array, " k"]) -> Float[
 
 
 class _Nearest(AbstractEquations):
-    """In the unknowns `(z, lambda)`."""
+    """The conditions of the nearest point, in the unknowns `(z, lambda)`."""
 
     g: Constrained
     guess: Float[Array, " n"]
@@ -84,7 +84,7 @@ class _Nearest(AbstractEquations):
 
 
 class _LeastChange(NamedTuple):
-    """Of the state, with a given rate of the residual: across the manifold."""
+    """The least change of the state, with a given rate of the residual: across the manifold."""
 
     G: Float[Array, "m n"]
     directions: Float[Array, "m n"]
@@ -101,7 +101,8 @@ def _across(g: Constrained, z: Float[Array, " n"]) -> tuple[Float[Array, " m"], 
 
 
 class _Approach(NamedTuple):
-    """Of the nearest point: the state, its multipliers, how far they are from stationary, and the
+    """The search for the nearest point: the state, its multipliers, how far they are from
+    stationary, and the
     part of the step across the manifold that is taken."""
 
     z: Float[Array, " n"]
@@ -142,7 +143,7 @@ def _approach(g: Constrained, guess: Float[Array, " n"], m: int) -> _Approach:
 
 
 class NearestState(NamedTuple):
-    """With its multipliers, and whether the iteration came to an end."""
+    """The nearest state with its multipliers, and whether the iteration came to an end."""
 
     z: Float[Array, " n"]
     multipliers: Float[Array, " m"]
@@ -158,7 +159,8 @@ def nearest_state(
     fixed: np.ndarray,
     args: Args,
 ) -> "NearestState":
-    """Of what holds without the unknowns that became states, which stay where they are."""
+    """Return the state nearest to the guess, of what holds without the unknowns that became
+    states, which stay where they are."""
     unlifted = system.static.plan.unlifted
     m = int(unlifted.c.sum())
     if m == 0:
@@ -183,7 +185,8 @@ def _damped(equations: AbstractEquations, start: Float[Array, " k"]) -> Iterate:
 
 
 def _polished(equations: AbstractEquations, start: Float[Array, " k"]) -> Float[Array, " k"]:
-    """By Newton's steps as long as each is less than half the one before: currents of 1e-12 solve
+    """Improve a root by Newton's steps as long as each is less than half the one before: currents
+    of 1e-12 solve
     their equations to rounding beside 1 with half their digits."""
     equations, start = without_derivative((equations, start))
 
@@ -222,7 +225,7 @@ class _Lifted(AbstractEquations):
 
 
 def with_lifted(system: Reduced, t: Array, z: Float[Array, " n"], args: Args) -> Float[Array, " n"]:
-    """With the unknowns that became states as they follow from the others."""
+    """Return the state with the unknowns that became states as they follow from the others."""
     layout, unlifted = system.static.plan.layout, system.static.plan.unlifted
     order, unknown = layout.names.T
     j = np.searchsorted(layout.aliases.roots, layout.aliases.root[unknown])

@@ -25,7 +25,8 @@ class Point(NamedTuple):
 
     @staticmethod
     def of(equations: Equations, x: Array, args: Args) -> "Point":
-        """With derivatives of zero. Floats in `args` are parameters like arrays are; whole numbers
+        """Return the point with derivatives of zero. Floats in `args` are parameters like arrays
+        are; whole numbers
         and everything else are taken as they are."""
         is_parameter = lambda leaf: eqx.is_inexact_array_like(leaf) or eqx.is_array(leaf)
         traced, fixed = eqx.partition(args, is_parameter)
@@ -75,7 +76,8 @@ class Occurrence(NamedTuple):
         )
 
     def without(self, before: "Occurrence", gone: dict[int, np.ndarray]) -> "Occurrence":
-        """Of equations of which some were replaced: `gone[row][k, j]` is not in them, the others
+        """Return the occurrence in equations of which some were replaced: `gone[row][k, j]` is not
+        in them, the others
         are those of `before`."""
         there = before.there.copy()
         for row, away in gone.items():
@@ -95,7 +97,8 @@ def _inputs(point: Point, number: int) -> tuple[tuple[Any, np.ndarray], ...]:
 def nonlinear_unknowns(
     equations: Equations, point: Point, levels: np.ndarray, unknowns: np.ndarray
 ) -> np.ndarray:
-    """In which of the derivatives `levels` of the `unknowns`, which are changed together, each
+    """Return in which of the derivatives `levels` of the `unknowns`, which are changed together,
+    each
     equation is not linear: shape `(n, number)`."""
     number = len(levels)
     leading = jnp.zeros(number, point.jets[0].dtype)

@@ -32,7 +32,7 @@ class Elimination(NamedTuple):
 
     @staticmethod
     def of(constant: np.ndarray, samples: list[np.ndarray]) -> "Elimination":
-        """From samples of the matrix, and where it is constant."""
+        """Choose pivots from samples of the matrix, and where it is constant."""
         rows, columns = _independent_pivots(constant, samples)
         n = constant.shape[0]
         others = [np.setdiff1d(np.arange(n), taken) for taken in (rows, columns)]

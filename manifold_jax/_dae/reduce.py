@@ -173,7 +173,7 @@ class _Analysis(NamedTuple):
 
 
 def _without_cancellations(found: _Analysis, point: Point) -> _Analysis:
-    """With combinations of equations from which derivatives are gone, as long as there are some."""
+    """Add combinations of equations from which derivatives are gone, as long as there are some."""
     while found.samples.singular:
         repairs = cancelled(
             found.equations,

@@ -59,13 +59,15 @@ class Structure(NamedTuple):
 
 
 def signature(occurs: np.ndarray) -> np.ndarray:
-    """From `occurs[i, k, j]`: whether the derivative `k` of unknown `j` is in equation `i`."""
+    """Return the signature matrix from `occurs[i, k, j]`: whether the derivative `k` of unknown
+    `j` is in equation `i`."""
     highest = occurs.shape[1] - 1 - np.argmax(occurs[:, ::-1], axis=1)
     return np.where(occurs.any(axis=1), highest, ABSENT)
 
 
 class SingularParts(NamedTuple):
-    """Of a matrix without a transversal (Dulmage & Mendelsohn, Canad. J. Math. 10 (1958) 517-534):
+    """The parts of a matrix without a transversal (Dulmage & Mendelsohn, Canad. J. Math. 10 (1958)
+    517-534):
     the equations that have too few unknowns for all of them, and those unknowns; the unknowns that
     too few equations are left for, and those equations."""
 
@@ -86,7 +88,7 @@ class SingularParts(NamedTuple):
 def _reached(
     there: np.ndarray, start: np.ndarray, back: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """By alternating paths: rows from `start`, to columns, and to the rows these belong to."""
+    """Follow alternating paths: rows from `start`, to columns, and to the rows these belong to."""
     rows = start.copy()
     while True:
         columns = there[rows].any(axis=0)

@@ -52,7 +52,7 @@ def put_on_bounds(u: Float[Array, " N"], side: np.ndarray) -> Float[Array, " N"]
 def put_beside_bounds(
     u: Float[Array, " N"], side: np.ndarray, left: Any, transform: Transform
 ) -> Float[Array, " N"]:
-    """With a small part `left` of the way from the start to the bound."""
+    """Return the unknowns with a small part `left` of the way from the start to the bound."""
     s, a, b = (np.asarray(x) for x in (transform.start, transform.lower, transform.upper))
     width = np.where(np.isfinite(b - a), b - a, 1.0)
     other = np.where(np.isfinite(b - a), np.where(side < 0, b - s, s - a), 1.0)
@@ -81,7 +81,7 @@ def _near(u: Float[Array, " N"], transform: Transform, left: float) -> np.ndarra
 
 
 def _linear_step(u: Any, solved: Solved, objective: Objective) -> np.ndarray:
-    """Of Gauss and Newton, `(N,)`."""
+    """Return the step of Gauss and Newton, `(N,)`."""
     J, r = stacked(u, solved, objective)
     size = np.linalg.norm(J, axis=0)
     size[size == 0] = 1.0

@@ -180,7 +180,8 @@ def fit(
 
 
 def _unknowns(objective: Any, options: Options) -> list[Any]:
-    """At all starts: those of the parameters, then those of initial states, which are at their guess."""
+    """Return the unknowns at all starts: those of the parameters, then those of initial states,
+    which are at their guess."""
     transform = objective.transform
     states = objective.free.size * objective.pieces.basis.shape[-1]
     check_amount(transform.start.size + states, objective)

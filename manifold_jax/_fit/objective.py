@@ -91,7 +91,8 @@ def solve(u: Float[Array, " N"], objective: Objective, batch: Any = None) -> Sol
 
 
 def _each(function: Callable, x: Any, pieces: Piece) -> Any:
-    """For every piece. A batch of one alone takes half as long again to trace, and both branches of
+    """Evaluate a function for every piece. A batch of one alone takes half as long again to trace,
+    and both branches of
     every condition to run."""
     if x.shape[0] > 1:
         return jax.vmap(function)(x, pieces)
@@ -100,7 +101,8 @@ def _each(function: Callable, x: Any, pieces: Piece) -> Any:
 
 
 def gaps(objective: Objective, predicted: Prediction) -> Float[Array, "joints d"]:
-    """From the end of a piece to the start of the next, along the manifold there."""
+    """Return the gaps from the end of a piece to the start of the next, along the manifold
+    there."""
     j = objective.joints
     jump = predicted.end[j] - predicted.begin[j + 1]
     gap = jnp.sum(objective.pieces.basis[j + 1] * jump[:, :, None], axis=1)
@@ -149,7 +151,8 @@ def stacked(u: Any, solved: Solved, objective: Objective) -> tuple[np.ndarray, n
 
 
 def residuals(u: Float[Array, " N"], objective: Objective) -> tuple[Any, Any]:
-    """For least-squares solvers: of the data and of the joints; then the loss and all pieces."""
+    """Return the residuals for least-squares solvers: of the data and of the joints; then the loss
+    and all pieces."""
     solved = solve(u, objective)
     predicted = solved.around(u, objective)
     r = weighted(objective, predicted)
@@ -160,7 +163,8 @@ def residuals(u: Float[Array, " N"], objective: Objective) -> tuple[Any, Any]:
 def total_loss(
     u: Float[Array, " N"], objective: Objective, batch: Any = None
 ) -> tuple[FloatScalar, Any]:
-    """For minimizers: the sum over all records, or the mean over those of a batch; then as above."""
+    """Return the loss for minimizers: the sum over all records, or the mean over those of a batch;
+    then as above."""
     x, pieces = objective.chosen(u, batch)
     if objective.reverse:
         predicted = _backwards_all(objective, x, pieces)
@@ -197,7 +201,7 @@ def _backwards_all(objective: Objective, x: Any, pieces: Piece) -> Prediction:
 
 @eqx.filter_custom_vjp
 def _backwards(x: Any, rest: Any) -> Prediction:
-    """For many unknowns: one sweep backwards instead of one forwards for each."""
+    """Differentiate for many unknowns: one sweep backwards instead of one forwards for each."""
     piece, simulator, transform = rest
     return simulator.predict(x, piece, transform, StepReplayAdjoint())
 

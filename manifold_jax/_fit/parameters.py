@@ -15,7 +15,7 @@ LARGEST = 50.0
 
 
 class Transform(eqx.Module):
-    r"""From `p` unknowns `u` on the whole line to parameters `theta` within their bounds.
+    r"""The map from `p` unknowns `u` on the whole line to parameters `theta` within their bounds.
 
     With the start `s`, the lower bound `a` and the upper bound `b`:
 

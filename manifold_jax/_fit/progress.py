@@ -30,7 +30,7 @@ class Meter:
 
     @contextmanager
     def compiling(self, what: str) -> Iterator[None]:
-        """Around the first use of a program; later ones are not worth a word."""
+        """Report the time of the first use of a program; later ones are not worth a word."""
         if what in self.known:
             yield
             return

@@ -28,7 +28,8 @@ class Quality(NamedTuple):
 def judge(
     u: Any, solved: Solved, objective: Objective, records: Records, absolute: bool
 ) -> Quality:
-    """From the residuals of records that were solved; `absolute`: whether `sigma` is known."""
+    """Judge a fit from the residuals of records that were solved; `absolute`: whether `sigma` is
+    known."""
     side = at_bounds(u, solved, objective)
     if objective.loss is not None:
         return Quality(None, None, None, None, (), side)

@@ -107,7 +107,7 @@ class FitResult(eqx.Module):
         return "\n".join(lines + (self._table() if len(self.starts) > 1 else []))
 
     def _verdict(self) -> list[str]:
-        """Of the optimizer, and if `sigma` is known of the model."""
+        """Return the verdict of the optimizer, and if `sigma` is known of the model."""
         state = "fitted" if self.success else "NOT FITTED"
         ended = f"{self.message} ({len(self.history)} steps)"
         if self.fits is not False:

@@ -119,7 +119,8 @@ def optimize_all(
 
 
 def _better(new: Outcome, old: Outcome) -> bool:
-    """Of the same optimum, rather one where the optimizer converged."""
+    """Return whether the new one is better; of the same optimum, prefer one where the optimizer
+    converged."""
     if abs(new.loss - old.loss) <= _SAME * abs(old.loss) and new.success != old.success:
         return new.success
     return new.loss < old.loss

@@ -65,7 +65,7 @@ def summarize(
 
 @eqx.filter_jit
 def _initial_states(u: Any, objective: Objective) -> Any:
-    """Of all records, on the manifold."""
+    """Return the initial states of all records, on the manifold."""
     x, pieces = objective.chosen(u)
 
     def one(x: Any, piece: Any) -> Any:

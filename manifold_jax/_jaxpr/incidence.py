@@ -33,7 +33,8 @@ class Incidence(NamedTuple):
 
 
 def incidence(function: Callable, *tracked: tuple[Any, np.ndarray]) -> Incidence:
-    """Of `function(*arguments)`, which returns one vector. For each argument, a pytree of arrays,
+    """Return the incidence of `function(*arguments)`, which returns one vector. For each argument,
+    a pytree of arrays,
     the inputs as which its numbers count: a bool array of shape `(numbers, inputs)`."""
     arguments = [argument for argument, _ in tracked]
     closed = jax.make_jaxpr(function)(*arguments)

@@ -10,7 +10,8 @@ from .incidence_moves import bind, landing, move, MOVES, num_moved
 
 
 class Value(NamedTuple):
-    """Of an array of shape `S`: the inputs its numbers depend on, shape `(*S, inputs + 1)`, and the
+    """What is known of an array of shape `S`: the inputs its numbers depend on, shape `(*S, inputs
+    + 1)`, and the
     numbers themselves if they are constants. Behind the inputs stands whether a number may be
     other than zero: for sums and moves that follows the same rule."""
 

@@ -82,7 +82,7 @@ def scan(
 
 
 def while_loop(evaluate: Evaluate, lanes: Lanes, equation: Any, values: list[Value]) -> list[Value]:
-    """For as long as any lane goes on; the others keep what they have."""
+    """Evaluate a loop for as long as any lane goes on; the others keep what they have."""
     params = equation.params
     m, n = params["cond_nconsts"], params["body_nconsts"]
     cond_consts, body_consts, start = values[:m], values[m : m + n], values[m + n :]

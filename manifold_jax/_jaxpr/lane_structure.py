@@ -107,7 +107,7 @@ def dot_general(lanes: Lanes, equation: Any, values: list[Value]) -> list[Value]
 
 
 def _arranged(value: Value, batch: Any, summed: Any) -> tuple[np.ndarray, list[int], list[int]]:
-    """With axes `(batch, free, summed)`."""
+    """Arrange a value with axes `(batch, free, summed)`."""
     x = value.numbers()
     free = [i for i in range(x.ndim) if i not in (*batch, *summed)]
     sizes = [[x.shape[i] for i in axes] for axes in (batch, free, summed)]

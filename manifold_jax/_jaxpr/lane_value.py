@@ -30,7 +30,8 @@ Number = Any
 
 
 class Value:
-    """Of shape `shape` in each lane. `numbers()` is an object array of that shape of [`Number`][]s;
+    """An array of shape `shape` in each lane. `numbers()` is an object array of that shape of
+    [`Number`][]s;
     `whole(lanes)` an array of shape `(*shape, count)`: the lanes are contiguous in memory.
 
     Whichever is not there is made when it is asked for.
@@ -54,7 +55,7 @@ class Value:
 
     @staticmethod
     def of_whole(x: jax.Array) -> "Value":
-        """From one array whose last axis is that of the lanes."""
+        """Make a value from one array whose last axis is that of the lanes."""
         value = Value(x.shape[:-1], x.dtype, lambda: _split(x, x.shape[:-1]))
         value._whole = x
         return value
@@ -77,7 +78,8 @@ class Value:
         return [lanes.array(x, self.dtype) for x in self.numbers().ravel()]
 
     def entering(self, lanes: Any) -> "Value":
-        """For the body of a loop, in which nothing may be made that is kept outside."""
+        """Return the value for the body of a loop, in which nothing may be made that is kept
+        outside."""
         numbers = [lanes.emitted(x) for x in self.numbers().ravel()]
         value = Value.of_numbers(object_array(numbers, self.shape), self.dtype)
         value._whole = self._whole
@@ -93,7 +95,7 @@ class Value:
 
 
 def object_array(items: list[Any], shape: tuple[int, ...]) -> np.ndarray:
-    """Of objects that are arrays themselves, which NumPy would look into."""
+    """Return an object array of objects that are arrays themselves, which NumPy would look into."""
     out = np.empty(len(items), object)
     for i, item in enumerate(items):
         out[i] = item

@@ -9,7 +9,8 @@ from jax.sharding import NamedSharding, PartitionSpec
 
 
 def example(shape: tuple[int, ...], dtype: Any) -> jax.ShapeDtypeStruct:
-    """Of an array of one lane. Inside `jax.shard_map` the types of arrays name the mesh, and
+    """Return the shape and type of an array of one lane. Inside `jax.shard_map` the types of
+    arrays name the mesh, and
     `eqx.filter_closure_convert` refuses those that do not where it has seen others."""
     mesh = jax.sharding.get_abstract_mesh()
     if mesh.empty:
@@ -19,7 +20,7 @@ def example(shape: tuple[int, ...], dtype: Any) -> jax.ShapeDtypeStruct:
 
 
 def num_equations(function: Callable[..., Any], *examples: Any) -> int:
-    """Of the function traced, inner functions included."""
+    """Count the equations of the traced function, inner functions included."""
     return _length(jax.make_jaxpr(function)(*examples).jaxpr)
 
 

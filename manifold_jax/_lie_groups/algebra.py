@@ -85,7 +85,8 @@ def rotation_rate(w: Vector, velocity: Vector, cayley: bool) -> Vector:
 
 
 def is_within_half_a_turn(w: Vector, cayley: bool) -> Bool[Array, ""]:
-    """By Cayley's map every `w` is, as it turns by `2 arctan(|w| / 2)`."""
+    """Return whether `w` is a turn by less than half a revolution. By Cayley's map every `w` is,
+    as it turns by `2 arctan(|w| / 2)`."""
     square = jnp.sum(w * w)
     return jnp.isfinite(square) if cayley else square < jnp.pi**2
 

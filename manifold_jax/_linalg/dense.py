@@ -99,7 +99,7 @@ _SMALLEST_INVERSE = 3
 
 
 def factorize_once(A: Float[Array, "m m"]) -> "Factorization | Inverse":
-    """For what is evaluated once in a step, or in a solve."""
+    """Factor a matrix, for what is evaluated once in a step, or in a solve."""
     if not _SMALLEST_INVERSE <= A.shape[0] <= UNROLL_LIMIT:
         return factorize(A)  # pyright: ignore[reportReturnType]
     return Inverse(*_invert(A))
@@ -186,7 +186,8 @@ _DEPENDENT = 1e-4
 def pseudo_invert(
     A: Float[Array, "m m"], *, equilibrated: bool = False, dependent: Any = _DEPENDENT
 ) -> PseudoInverse:
-    """Of a symmetric positive semidefinite matrix; `equilibrated` with its diagonal scaled to one,
+    """Return the pseudo-inverse of a symmetric positive semidefinite matrix; `equilibrated` with
+    its diagonal scaled to one,
     so that the units of equations do not decide which of them depend on others. Eigenvalues below
     `dependent` times the largest count as zero."""
     finite = jnp.all(jnp.isfinite(A))
@@ -202,7 +203,8 @@ def pseudo_invert(
 
 @ForwardRule
 def _pseudo_inverse(A: Float[Array, "m m"], dependent: FloatScalar) -> Float[Array, "m m"]:
-    """Of a symmetric matrix. (The derivative of `jnp.linalg.pinv` cannot be differentiated again
+    """Return the pseudo-inverse of a symmetric matrix. (The derivative of `jnp.linalg.pinv` cannot
+    be differentiated again
     where `rtol` is an array.)"""
     values, V = jnp.linalg.eigh(A, symmetrize_input=False)
     used = jnp.abs(values) > dependent * jnp.max(jnp.abs(values))
@@ -211,7 +213,7 @@ def _pseudo_inverse(A: Float[Array, "m m"], dependent: FloatScalar) -> Float[Arr
 
 @_pseudo_inverse.define_jvp
 def _pseudo_inverse_jvp(P, primals, tangents):
-    """At constant rank (Golub & Pereyra 1973)."""
+    """The derivative at constant rank (Golub & Pereyra 1973)."""
     (A, _), (A_dot, _) = primals, tangents
     one = jnp.eye(A.shape[0], dtype=A.dtype)
     turned = P @ P @ A_dot.T @ (one - A @ P)

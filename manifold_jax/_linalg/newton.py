@@ -33,7 +33,7 @@ class AbstractEquations(eqx.Module):
 
     @abc.abstractmethod
     def residual(self, x: Float[Array, " n"]) -> Float[Array, " m"]:
-        """At a point."""
+        """Return the residual at a point."""
 
     @abc.abstractmethod
     def linearize(self, x: Float[Array, " n"]) -> Linearization:
@@ -147,7 +147,8 @@ def damped_newton(
 def find_root(
     equations: AbstractEquations, guess: Float[Array, " n"], max_steps: int = 50
 ) -> Float[Array, " n"]:
-    """For as long as every step lowers `max_i |r_i|`: the best point found. Simple roots are found
+    """Iterate for as long as every step lowers `max_i |r_i|`: the best point found. Simple roots
+    are found
     to round-off."""
     r = equations.residual(equations.point(guess))
     return damped_newton(equations, guess, r, jnp.ones_like(r), max_steps, jnp.inf).z

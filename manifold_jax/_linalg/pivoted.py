@@ -44,7 +44,7 @@ class UnrolledElimination(eqx.Module):
 
 
 class Library(eqx.Module):
-    """By LAPACK."""
+    """An LU factorization by LAPACK."""
 
     lu: tuple[Float[Array, "n n"], Array]
 

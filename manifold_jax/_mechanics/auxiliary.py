@@ -91,7 +91,8 @@ def check_auxiliary_rates(rates: Any, z: Y) -> None:
 
 
 def _projections(projection: NewtonProjection, y: Y) -> tuple[NewtonProjection, NewtonProjection]:
-    """Of the motion and of the auxiliary states, each with its part of the metric."""
+    """Return the projections of the motion and of the auxiliary states, each with its part of the
+    metric."""
     if projection.metric is None or isinstance(projection.metric, str):
         return projection, projection
     if jtu.tree_structure(projection.metric) != jtu.tree_structure(y):

@@ -113,7 +113,8 @@ class MechanicalConstraint(AbstractConstraint):
 def whole_structure(
     constraint: AbstractConstraint, t: RealScalarLike, y: Y, args: Args
 ) -> Structure | None:
-    """Of all equations with respect to the whole state, if they are sparse, too."""
+    """Return the structure of all equations with respect to the whole state, if they are sparse,
+    too."""
     x, unravel = jfu.ravel_pytree(y)
     t = as_time(t, x.dtype)
     return structure_of(((lambda x: residual_vector(constraint, t, unravel(x), args), x),))

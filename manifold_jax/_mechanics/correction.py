@@ -142,7 +142,8 @@ class TwoStages(NamedTuple):
 
 
 class MechanicalNormals(NamedTuple):
-    """With respect to the velocities; how many of the rows belong to positions, and whether the
+    """The constraint normals with respect to the velocities; how many of the rows belong to
+    positions, and whether the
     mass matrix can be used."""
 
     normals: ConstraintNormals

@@ -26,7 +26,7 @@ class AbstractPositions(eqx.Module):
 
     @abc.abstractmethod
     def jacobian(self, t: RealScalarLike, q: Y, args: Args) -> Float[Array, "p k"]:
-        """In the orders of `ravel_pytree` of the residual and of `q`."""
+        """Return the Jacobian in the orders of `ravel_pytree` of the residual and of `q`."""
 
 
 class Kinematics(NamedTuple):
@@ -42,7 +42,8 @@ class Kinematics(NamedTuple):
 
     @staticmethod
     def of(system: Any, y: Y) -> "Kinematics":
-        """Of a mechanical system, or of its constraint, for states like `y`."""
+        """Return the kinematics of a mechanical system, or of its constraint, for states like
+        `y`."""
         q, _ = check_mechanical_state(y)
         unravel = jfu.ravel_pytree(q)[1]
         return Kinematics(
@@ -109,7 +110,7 @@ class Kinematics(NamedTuple):
     def structure_at(
         self, t: Array, x: Float[Array, " k"], w: Float[Array, " k"], args: Args
     ) -> Structure | None:
-        """Of the rows, if they are sparse. Known while tracing."""
+        """Return the structure of the rows, if they are sparse. Known while tracing."""
         if self.structure == "dense" or self.redundant:
             return None
         equations = []

@@ -95,12 +95,12 @@ class Assembly(eqx.Module):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of the bodies, in the order of the rows of a [`Pose`][]."""
+        """The names of the bodies, in the order of the rows of a [`Pose`][]."""
         return self.bodies.names
 
     @property
     def joint_names(self) -> tuple[str, ...]:
-        """In the order of the multipliers: kind by kind."""
+        """The names of the joints in the order of the multipliers: kind by kind."""
         return tuple(name for group in self.joints for name in group.attachment.names)
 
     def state(
@@ -174,7 +174,7 @@ class Assembly(eqx.Module):
         return reading.energy(self, y)
 
     def joints_at(self, t: RealScalarLike, args: Args) -> tuple[JointGroup, ...]:
-        """With the motions of drives at that time."""
+        """Return the joints with the motions of drives at that time."""
         return tuple(group.at(t, args) for group in self.joints)
 
     def _equations(self, t: RealScalarLike, q: Pose, args: Args) -> tuple[Array, ...]:

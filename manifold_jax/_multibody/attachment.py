@@ -29,7 +29,8 @@ class Sides(NamedTuple):
         return self.second - self.first
 
     def cosine(self, i: int, j: int) -> Float[Array, " k"]:
-        """Of the angle between axis `i` of the first and axis `j` of the second body."""
+        """Return the cosine of the angle between axis `i` of the first and axis `j` of the second
+        body."""
         return dot(self.frame_first[:, :, i], self.frame_second[:, :, j])
 
     def along(self, i: int) -> Float[Array, " k"]:
@@ -58,13 +59,13 @@ class Attachment(eqx.Module):
         return self.sides_of(Placed(frames.origin[self.index], frames.rotation[self.index]))
 
     def sides_of(self, placed: Placed) -> Sides:
-        """With the frames of the bodies to which they belong, `(2, k, ...)`."""
+        """Return the sides with the frames of the bodies to which they belong, `(2, k, ...)`."""
         at = placed.origin + turn(placed.rotation, self.points)
         axes = compose(placed.rotation, self.axes)
         return Sides(at[0], at[1], axes[0], axes[1])
 
     def velocities(self, frames: Frames, sides: Sides) -> Float[Array, "k 3"]:
-        """Of the second points against the first."""
+        """Return the velocities of the second points against the first."""
         arms = jnp.stack([sides.first, sides.second]) - frames.origin[self.index]
         moving = frames.velocity[self.index] + jnp.cross(frames.spin[self.index], arms)
         return moving[1] - moving[0]

@@ -174,7 +174,7 @@ class Bodies(eqx.Module):
         return self.inertia.ndim == 1
 
     def index(self, name: Any, of: str) -> int:
-        """Of a body; the ground comes after the last."""
+        """Return the number of a body; the ground comes after the last."""
         if name == GROUND:
             return len(self.names)
         if name not in self.names:

@@ -14,7 +14,7 @@ from .._base.user_functions import check_function
 
 
 def check_value(word: str, value: Any, name: str, shape: tuple[int, ...]) -> Any:
-    """That of the argument `word` of the thing called `name`."""
+    """Return the value of the argument `word` of the thing called `name`."""
     if callable(value):
         check_function(f"{word}` of `{name}", value, "f(t, args)")
         return value
@@ -83,7 +83,7 @@ def check_axis(what: str, value: Any) -> Array:
 
 
 def as_pair(what: str, value: Any) -> tuple[Any, Any]:
-    """Of points or axes; also the two rows of an array."""
+    """Return a pair of points or axes; also the two rows of an array."""
     is_array = isinstance(value, jax.Array | np.ndarray) and value.ndim == 2
     if not (isinstance(value, tuple | list) or is_array) or len(value) != 2:
         raise ValueError(f"{what}, got {value!r}.")
@@ -91,7 +91,7 @@ def as_pair(what: str, value: Any) -> tuple[Any, Any]:
 
 
 def check_sequence(what: str, value: Any, kind: type, of: str) -> list[Any]:
-    """Of things of one kind, as a list."""
+    """Return a sequence of things of one kind, as a list."""
     try:
         things = list(value)
     except TypeError:

@@ -65,7 +65,7 @@ def _planar_fixed(s: Sides, length: Any) -> Float[Array, "k 3"]:
 
 
 def _driven_angle(s: Sides, target: Float[Array, " k"]) -> Float[Array, "k 1"]:
-    """By how much the second body is ahead, from `-pi` to `pi`."""
+    """Return by how much the second body is ahead, from `-pi` to `pi`."""
     sine, cosine = s.cosine(1, 0), s.cosine(0, 0)
     ahead = sine * jnp.cos(target) - cosine * jnp.sin(target)
     return _columns(jnp.arctan2(ahead, cosine * jnp.cos(target) + sine * jnp.sin(target)))

@@ -42,7 +42,7 @@ class AbstractLineForce(AbstractForce):
 
 
 class AbstractJointForce(AbstractForce):
-    """In a hinge or slider, against its coordinate."""
+    """A force in a hinge or slider, against its coordinate."""
 
     joint: eqx.AbstractVar[str]
 

@@ -24,7 +24,7 @@ class Placed(NamedTuple):
 
     @staticmethod
     def of_rows(rows: Float[Array, "*n c"], planar: bool) -> "Placed":
-        """From rows of coordinates."""
+        """Make frames from rows of coordinates."""
         d = 2 if planar else 3
         return Placed.of(Pose(rows[..., :d], rows[..., 2] if planar else rows[..., 3:]))
 

@@ -47,7 +47,7 @@ class JointGroup(eqx.Module):
         return self.equations(self.attachment.sides_of(placed), self.length)
 
     def at(self, t: RealScalarLike, args: Args) -> "JointGroup":
-        """With its motions at the time."""
+        """Return the group with its motions at the time."""
         if self.motions is None:
             return self
         names = self.attachment.names
@@ -78,7 +78,7 @@ Found = tuple[JointGroup, int]  # a joint: its group and its place in that
 
 
 def find_joint(groups: tuple[JointGroup, ...], joint: str, name: str) -> Found:
-    """For the force or drive called `name`."""
+    """Find the joint for the force or drive called `name`."""
     groups = tuple(group for group in groups if group.motions is None)
     for group in groups:
         if joint in group.attachment.names:
@@ -88,7 +88,7 @@ def find_joint(groups: tuple[JointGroup, ...], joint: str, name: str) -> Found:
 
 
 def attachment_of(found: list[Found], names: Sequence[str]) -> Attachment:
-    """To the bodies of joints, as these are."""
+    """Return the attachment to the bodies of joints, as these are."""
 
     def of_joints(part: str) -> Array:
         rows = [(getattr(group.attachment, part), i) for group, i in found]
@@ -124,7 +124,7 @@ def _drawn_lengths(attachment: Attachment, drawing: Pose) -> Float[Array, " k"]:
 
 
 def residuals(groups: tuple[JointGroup, ...], q: Pose) -> tuple[Float[Array, "k r"], ...]:
-    """Of all joints, kind by kind."""
+    """Return the residuals of all joints, kind by kind."""
     return _residuals(groups, with_ground(q)[_index(groups)], q.planar)
 
 
@@ -154,7 +154,7 @@ def jacobian(groups: tuple[JointGroup, ...], q: Pose) -> Float[Array, "r n c"]:
 
 
 def _residuals(groups: tuple[JointGroup, ...], here: Float[Array, "2 k c"], planar: bool) -> Any:
-    """From the coordinates of the bodies of all joints."""
+    """Compute the residuals from the coordinates of the bodies of all joints."""
     placed = Placed.of_rows(here, planar)
     found, start = [], 0
     for group in groups:

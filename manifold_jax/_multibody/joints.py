@@ -174,7 +174,8 @@ def ends(thing: Any, name: str, planar: bool) -> tuple[bool, Any, Any]:
 
 
 def drawn_axes(joint: AbstractJoint, name: str, planar: bool) -> tuple[Any, Any]:
-    """Of the first and of the second body, in space. In the plane the axis of a slider lies in it."""
+    """Return the axes of the first and of the second body, in space. In the plane the axis of a
+    slider lies in it."""
     axis = getattr(joint, "axis", None)
     if not isinstance(joint, WITH_AXIS[planar]):
         if axis is not None:

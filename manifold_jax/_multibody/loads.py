@@ -70,7 +70,8 @@ class LineLoads(AbstractLoads):
     def _pull(
         self, t: RealScalarLike, gap: Float[Array, "k 3"], velocity: Float[Array, "k 3"], args: Args
     ) -> Float[Array, "k 3"]:
-        """On the first points. Where two coincide, the direction of their line is that of their
+        """Return the forces on the first points. Where two coincide, the direction of their line
+        is that of their
         motion: the limit of what has one, not a number for what jumps there from one side to the
         other."""
         distance = length_of(gap)
@@ -89,7 +90,7 @@ class LineLoads(AbstractLoads):
 
 
 class JointLoads(AbstractLoads):
-    """In hinges, or in sliders."""
+    """Forces in hinges, or in sliders."""
 
     hinge: bool = eqx.field(static=True)
     attachment: Attachment

@@ -58,7 +58,7 @@ def import_mujoco() -> Any:
 
 
 def name_of(mujoco: Any, model: Any, kind: str, i: Index) -> str:
-    """Of an element; `"body 3"` for one without."""
+    """Return the name of an element; `"body 3"` for one without."""
     if kind == "dof":
         kind, i = "joint", model.dof_jntid[i]
     code = getattr(mujoco.mjtObj, f"mjOBJ_{kind.upper()}")

@@ -125,11 +125,11 @@ class Tree:
         return Fixed(*map(self.body, bodies), at=at, name=name)
 
     def _in_space(self, body: Index, point: np.ndarray) -> np.ndarray:
-        """Of a point in MuJoCo's frame of a body."""
+        """Return the position in space of a point in MuJoCo's frame of a body."""
         return self.drawing.xpos[body] + self.drawing.xmat[body].reshape(3, 3) @ point
 
     def _in_body(self, body: Index, point: np.ndarray) -> np.ndarray:
-        """In our frame, that of its inertia."""
+        """Return the point in our frame, that of its inertia."""
         name = self.body(body)
         if name == GROUND:
             return point

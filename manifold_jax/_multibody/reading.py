@@ -22,7 +22,8 @@ Times = RealScalarLike | Float[Array | np.ndarray, "*t"]  # of one state, or of 
 
 
 class Motion(NamedTuple):
-    """Of one body: its centre of mass and orientation, velocity, and angular velocity in the
+    """The motion of one body: its centre of mass and orientation, velocity, and angular velocity
+    in the
     coordinates of space (in the plane a number)."""
 
     position: Float[Array, "*t d"]
@@ -51,7 +52,7 @@ class Energy(NamedTuple):
 
 
 def over_times(function: Callable) -> Callable:
-    """For states with leading axes, too, such as `sol.ys`."""
+    """Map a function over states with leading axes, too, such as `sol.ys`."""
 
     def spread(assembly: Any, y: tuple[Pose, Pose], *rest: Any) -> Any:
         if y[0].position.ndim == 2:

@@ -45,7 +45,7 @@ INCONSISTENT = 3
 
 
 class Linearized(NamedTuple):
-    """At one time and state.
+    """The equations linearized at one time and state.
 
     - `derivative`: `y'`.
     - `newton`: Newton's step towards consistency.
@@ -151,7 +151,8 @@ def is_consistent(x: Float[Array, " n"], linearized: Linearized) -> BoolScalar:
 
 
 def is_small(correction: FloatScalar) -> BoolScalar:
-    """To half of the digits: what is beside that would have to be a mistake."""
+    """Return whether a correction is small to half of the digits: what is beside that would have
+    to be a mistake."""
     return correction <= jnp.sqrt(jnp.finfo(correction.dtype).eps)
 
 

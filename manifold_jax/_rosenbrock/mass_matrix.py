@@ -108,7 +108,8 @@ class MassMatrixTerm(dfx.AbstractTerm):
         return unravel(self.equations(y, args).at(t, x).derivative)
 
     def equations(self, y: Y, args: Args) -> Equations:
-        """In the vector of all numbers of the state; `y` is an example of one."""
+        """Return the equations in the vector of all numbers of the state; `y` is an example of
+        one."""
         _, unravel = jfu.ravel_pytree(y)
 
         def field(t: RealScalarLike, x: Float[Array, " n"]) -> Float[Array, " n"]:

@@ -91,6 +91,6 @@ class System(NamedTuple):
 
 
 def mass_matrix_term(terms: Any) -> MassMatrixTerm | None:
-    """That of an equation with a mass matrix, also if time is negated."""
+    """Return the term of an equation with a mass matrix, also if time is negated."""
     inner = undirected(terms)
     return inner if isinstance(inner, MassMatrixTerm) else None

@@ -79,7 +79,7 @@ def check_max_steps(max_steps: Any) -> None:
 
 
 def explained(function: Function) -> Function:
-    """Around a solve: of an error in it that comes from a vector field unlike the state, say so."""
+    """Wrap a solve: of an error in it that comes from a vector field unlike the state, say so."""
     signature = inspect.signature(function)
 
     @functools.wraps(function)

@@ -29,7 +29,7 @@ _NO_END = "`t1` is NaN: it must be a number, or infinite if an event ends the so
 
 
 def checking_first_step(function: Function) -> Function:
-    """Around a solve whose numbers become arrays: refuse a first step that is known to be none."""
+    """Wrap a solve whose numbers become arrays: refuse a first step that is known to be none."""
     place = list(inspect.signature(function).parameters).index("dt0")
 
     @functools.wraps(function)
@@ -55,7 +55,8 @@ def is_no_step(dt0: RealScalarLike) -> BoolScalar:
 
 
 class _Faults(NamedTuple):
-    """Of the times of a solve: whether there are any, which one to name, and what to say of each."""
+    """The faults of the times of a solve: whether there are any, which one to name, and what to
+    say of each."""
 
     any: BoolScalar
     number: IntScalar
@@ -84,7 +85,7 @@ def _attach(t0: Any, fault: BoolScalar, number: Any, messages: list[str]) -> Any
 
 
 def refusing_missing_times(function: Function) -> Function:
-    """Around a solve: with `throw` an error that names the time at fault, otherwise the result code
+    """Wrap a solve: with `throw` an error that names the time at fault, otherwise the result code
     `RESULTS.nonfinite_input`. Times that are known while tracing are looked at there, and cost nothing."""
     signature = inspect.signature(function)
 

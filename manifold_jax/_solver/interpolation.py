@@ -125,7 +125,7 @@ class ManifoldInterpolation(dfx.AbstractPath):
         return ManifoldInterpolation(inner, arrays, (tuple(leaves), tree))
 
     def __deepcopy__(self, memo: dict[int, Any]) -> "ManifoldInterpolation":
-        """With arrays of its own; traced functions do not change."""
+        """Copy with arrays of its own; traced functions do not change."""
         inner, arrays = copy.deepcopy((self.inner, self.arrays), memo)
         return ManifoldInterpolation(inner, arrays, self.functions)
 

@@ -76,7 +76,7 @@ class Stabilized(AbstractManifoldSolver):
         return self.stabilization.ends_on_manifold
 
     def prepare_terms(self, terms: Any) -> Any:
-        """With the stabilized vector field."""
+        """Return terms with the stabilized vector field."""
         if is_sde(terms):
             raise ValueError(
                 "`terms` has noise, which no stabilization of the drift keeps on the manifold. Use "

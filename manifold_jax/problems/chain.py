@@ -25,7 +25,8 @@ class ChainArgs(NamedTuple):
 
 
 def _links(points: Float[Array, " n"]) -> Float[Array, "N 2"]:
-    """From the points `(x1, y1, x2, y2, ...)` to the vectors between them, the support first."""
+    """Return the links from the points `(x1, y1, x2, y2, ...)` to the vectors between them, the
+    support first."""
     return jnp.diff(points.reshape(-1, 2), axis=0, prepend=jnp.zeros((1, 2), points.dtype))
 
 

@@ -63,7 +63,7 @@ def _motion(xp: Any, y: Any) -> tuple[Any, Any, Any, Any]:
 
 
 def _moved(xp: Any, centre: Any, velocity: Any, angle: Any, rate: Any, args: Any, joints: int):
-    """Of shape `(..., joints, 2, 2)`; the motion may have leading axes."""
+    """Return the joints of shape `(..., joints, 2, 2)`; the motion may have leading axes."""
     along, up = np.meshgrid(np.arange(joints) - (joints - 1) / 2, [-0.5, 0.5], indexing="ij")
     x = args.length * xp.asarray(along, args.length.dtype)
     y = args.height * xp.asarray(up, args.height.dtype)

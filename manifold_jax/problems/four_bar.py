@@ -109,7 +109,8 @@ def _exact(t: np.ndarray, args: FourBarArgs, y0: Any) -> tuple[np.ndarray, np.nd
 
 
 def _crank_equation(args: FourBarArgs) -> Callable[[float, np.ndarray], tuple[float, ...]]:
-    """Of the three angles and the rate of the crank; lists of floats, which are fast."""
+    """Return the equation of the three angles and the rate of the crank; lists of floats, which
+    are fast."""
     a, b, c, _ = args.lengths.tolist()
     m1, m2, m3 = args.masses.tolist()
     g = float(args.gravity)

@@ -79,7 +79,8 @@ def _weight(q: Vector, args: HeavyTopArgs) -> FloatScalar:
 
 
 def _force(t: RealScalarLike, q: Vector, v: Vector, args: HeavyTopArgs) -> Vector:
-    """Of the Lagrangian `(2 G(q) v).I (2 G(q) v) / 2 - V(q)`, with `G(q) v = -G(v) q`."""
+    """Return the force of the Lagrangian `(2 G(q) v).I (2 G(q) v) / 2 - V(q)`, with `G(q) v =
+    -G(v) q`."""
     del t
     gyroscopic = -8 * _rates(v).T @ (args.inertia * (_rates(q) @ v))
     return gyroscopic - jax.grad(_weight)(q, args)

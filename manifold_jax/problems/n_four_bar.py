@@ -30,7 +30,8 @@ def _mass(q: Bodies, args: NFourBarArgs) -> Bodies:
 
 
 def _joints(t: RealScalarLike, q: Bodies, args: NFourBarArgs) -> Any:
-    """Of the crank with the ground, with the coupler before it and with that after it."""
+    """Return the gaps of the joints of the crank with the ground, with the coupler before it and
+    with that after it."""
     del t
     half = 0.5 * args.length * jnp.stack([jnp.cos(q[:, 2]), jnp.sin(q[:, 2])], axis=1)
     start, end = q[:, :2] - half, q[:, :2] + half

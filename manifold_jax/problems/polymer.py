@@ -72,13 +72,13 @@ def _exact(t: np.ndarray, args: PolymerArgs, y0: Any) -> tuple[np.ndarray, np.nd
 
 
 def rods(args: PolymerArgs) -> Rods:
-    """For reference solutions."""
+    """Return the rods for reference solutions."""
     bead = np.arange(args.lengths.size)
     return Rods.between(bead, bead + 1, 1 / args.masses)
 
 
 def force(args: PolymerArgs) -> Callable[[np.ndarray], np.ndarray]:
-    """In NumPy."""
+    """Return the force, in NumPy."""
     args = PolymerArgs(*(np.asarray(part) for part in args))
     return lambda q: _bending(np, q, args)
 
@@ -147,7 +147,7 @@ def _per(value: Array, number: int, what: str) -> Array:
 def _thermal(
     args: PolymerArgs, temperature: float, random: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Of angles between bonds with the density `exp(-V / temperature)`."""
+    """Draw a thermal state of angles between bonds with the density `exp(-V / temperature)`."""
     masses, lengths, stiffness = (np.asarray(part, np.float64) for part in args)
     bonds = lengths.size
     stretch = max(float(stiffness) / temperature, 1e-8)

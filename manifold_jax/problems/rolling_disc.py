@@ -45,7 +45,7 @@ def _force(t: RealScalarLike, q: Vector, v: Vector, args: RollingDiscArgs) -> Ve
 
 
 def _initial_state(args: RollingDiscArgs, start: State | None) -> State:
-    """At the origin, or the position and the two angular velocities of `start`."""
+    """Return the state at the origin, or the position and the two angular velocities of `start`."""
     if start is None:
         start = (jnp.asarray([0.0, 0.0, 0.4, 0.0]), jnp.asarray([0.0, 0.0, 1.5, 2.0]))
     q, v = start
@@ -63,7 +63,7 @@ def _exact(t: np.ndarray, args: RollingDiscArgs, y0: Any) -> tuple[np.ndarray, n
     k = args.gravity * np.sin(args.slope) / (1 + args.rolling_inertia / (args.mass * R**2))
 
     def integrals(t):
-        """Of `cos h` and `sin h`; `turning` may be zero."""
+        """Return the integrals of `cos h` and `sin h`; `turning` may be zero."""
         middle, chord = heading0 + turning * t / 2, t * np.sinc(turning * t / (2 * np.pi))
         return chord * np.cos(middle), chord * np.sin(middle)
 

@@ -70,7 +70,8 @@ def _force(t: RealScalarLike, q: Vector, v: Vector, args: SliderCrankArgs) -> Ve
 
 
 def _initial_state(args: SliderCrankArgs, start: State | None) -> State:
-    """At rest with the crank upright, or assembled from the crank's angle and rate of `start`."""
+    """Return the state at rest with the crank upright, or assembled from the crank's angle and
+    rate of `start`."""
     a = args.crank_length
     if start is None:
         crank, rate, rod = jnp.full_like(a, math.pi / 2), jnp.zeros_like(a), jnp.zeros_like(a)

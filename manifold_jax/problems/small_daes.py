@@ -113,7 +113,7 @@ def _arevalo_constraint(args: None, y0: State) -> Constraint:
 
 
 def _arevalo_exact(t: np.ndarray, args: None, y0: Any) -> tuple[np.ndarray, np.ndarray]:
-    """With `q = (sin p, cos p)` the motion is `p'' = 2`."""
+    """Return the exact solution. With `q = (sin p, cos p)` the motion is `p'' = 2`."""
     del args
     (x, y), (vx, vy) = y0
     elapsed = t - AREVALO_T0

@@ -105,7 +105,7 @@ def assembly(args: StewartPlatformArgs) -> Assembly:
 
 
 def _quaternions(xp: Any, frames: Any) -> Any:
-    """Of rotation matrices `(..., 3, 3)` whose trace is not near -1."""
+    """Return the quaternions of rotation matrices `(..., 3, 3)` whose trace is not near -1."""
     R = lambda i, j: frames[..., i, j]
     a = xp.sqrt(1 + R(0, 0) + R(1, 1) + R(2, 2)) / 2
     vector = xp.stack([R(2, 1) - R(1, 2), R(0, 2) - R(2, 0), R(1, 0) - R(0, 1)], axis=-1)
@@ -120,7 +120,7 @@ def _spinning(xp: Any, p: Any, spin: Any) -> Any:
 
 
 def _rotation(xp: Any, p: Any) -> Any:
-    """Of a unit quaternion."""
+    """Return the rotation matrix of a unit quaternion."""
     a, v = p[0], p[1:]
     cross = xp.cross(xp.eye(3, dtype=v.dtype), v)  # the matrix of v x
     return (2 * a * a - 1) * xp.eye(3, dtype=v.dtype) + 2 * v[:, None] * v[None, :] + 2 * a * cross
@@ -184,7 +184,8 @@ def _twist_equation(args: StewartPlatformArgs) -> Any:
     disc = np.array([0.25, 0.25, 0.5]) * args.platform_mass * size**2
 
     def velocities(x, R, u, w):
-        """Of centres of mass and of turning, `(..., 13, 3)`, for twists `(..., 3)`."""
+        """Return the velocities of centres of mass and of turning, `(..., 13, 3)`, for twists
+        `(..., 3)`."""
         arms = local @ R.T
         length, frames = _legs(np, base, arms + x, first_axes)
         moving = u[..., None, :] + np.cross(w[..., None, :], arms)

@@ -70,7 +70,7 @@ def over_devices(
 
 
 def _lengthened(x: Array, size: int, mesh: Mesh) -> Array:
-    """By copies of the last trajectory."""
+    """Lengthen an array by copies of the last trajectory."""
     missing = size - x.shape[0]
     if missing == 0:
         return x

@@ -17,7 +17,7 @@ _IN_PROGRAM = ("sample", "terms", "solver", "t0", "t1", "dt0", "saveat", "stepsi
 
 
 def settings_of(given: dict[str, Any], program: str) -> dict[str, Any]:
-    """As JSON has them. `program`: what was traced, before it is compiled."""
+    """Return the settings as JSON has them. `program`: what was traced, before it is compiled."""
     words = {name: _described(value) for name, value in given.items()}
     device = jax.devices()[0]
     versions = {f"version of {name}": version(name) for name in _PACKAGES}
@@ -40,7 +40,8 @@ def _described(value: Any) -> Any:
 
 
 def _fingerprint(program: str, inputs: Any) -> str:
-    """Of a program and of the arrays it is called with, those in functions included."""
+    """Return a fingerprint of a program and of the arrays it is called with, those in functions
+    included."""
     digest = hashlib.sha256(program.encode())
     for leaf in jtu.tree_leaves(eqx.filter(inputs, eqx.is_array)):
         digest.update(np.asarray(leaf).tobytes())

@@ -136,7 +136,7 @@ def solve_ensemble(
 
 
 def _example(batch: Batch) -> str:
-    """For errors in what the user wrote."""
+    """Describe one trajectory, for errors in what the user wrote."""
     one = jax.eval_shape(batch.one)
     return (
         f"Of the {batch.size} trajectories of `y0s` each has a state of shapes {jtu.tree_map(jnp.shape, one.y0)}: the "

@@ -23,7 +23,8 @@ Axes = tuple[str, ...]
 
 
 def largest(x: Array, axes: Axes) -> Array:
-    """Of all trajectories. Every process raises what one has to raise: else it would wait for it."""
+    """Return the largest value of all trajectories. Every process raises what one has to raise:
+    else it would wait for it."""
     return lax.pmax(jnp.max(x), axes) if axes else jnp.max(x)
 
 
@@ -40,7 +41,7 @@ class Batch(eqx.Module):
     size: int = eqx.field(static=True)
 
     def complete(self, each: Any) -> Given:
-        """Of one trajectory, from its part of `each`."""
+        """Return the arguments of one trajectory, from its part of `each`."""
         t0, t1, y0, args = eqx.combine(each, self.common)
         return Given(jnp.asarray(t0, self.dtype), jnp.asarray(t1, self.dtype), y0, args)
 
@@ -112,7 +113,8 @@ def checked_times(saveat: dfx.SaveAt, batch: Batch, axes: Axes) -> dfx.SaveAt:
 
 
 def _ends(batch: Batch) -> tuple[Array, Array]:
-    """Of the time of each trajectory; where all have the same, of one: XLA takes seconds to compute
+    """Return the ends of the time of each trajectory; where all have the same, of one: XLA takes
+    seconds to compute
     while compiling what thousands of equal constants amount to."""
     t0, t1, *_ = batch.common
     if t0 is not None and t1 is not None:
@@ -129,7 +131,7 @@ def _size(x: Any) -> int | None:
 
 
 def _axes(args_axes: Any, args: Args) -> Any:
-    """For each leaf of `args` whether it has a leading axis of trajectories."""
+    """Return for each leaf of `args` whether it has a leading axis of trajectories."""
     for axis in jtu.tree_leaves(args_axes):
         if axis not in (0, None):
             raise ValueError(f"`args_axes` must be 0 or None, or a tree of them, got {axis!r}.")

@@ -22,13 +22,13 @@ class Layout(NamedTuple):
 
     @staticmethod
     def of(tree: Any) -> "Layout":
-        """Of a tree of [`Value`][]s, or of arrays of one trajectory."""
+        """Return the layout of a tree of [`Value`][]s, or of arrays of one trajectory."""
         leaves, treedef = jtu.tree_flatten(tree)
         return Layout(treedef, [x.shape for x in leaves], [x.dtype for x in leaves])
 
     @staticmethod
     def of_one(tree: Any) -> "Layout":
-        """Of one of the trajectories that arrays have in front."""
+        """Return the layout of one of the trajectories that arrays have in front."""
         return Layout.of(jtu.tree_map(lambda x: example(x.shape[1:], x.dtype), tree))
 
     def dtypes_of_columns(self) -> list[Any]:
@@ -36,7 +36,7 @@ class Layout(NamedTuple):
         return [dtype for shape, dtype in each for _ in range(math.prod(shape))]
 
     def example(self) -> Any:
-        """To trace functions of one trajectory with."""
+        """Return an example to trace functions of one trajectory with."""
         leaves = [example(s, d) for s, d in zip(self.shapes, self.dtypes, strict=True)]
         return jtu.tree_unflatten(self.treedef, leaves)
 
@@ -49,7 +49,7 @@ class Layout(NamedTuple):
         return jtu.tree_unflatten(self.treedef, out)
 
     def arrays(self, columns: list[jax.Array]) -> Any:
-        """With the trajectories in front."""
+        """Return the arrays of columns, with the trajectories in front."""
         out, k = [], 0
         rows = columns[0].shape[0] if columns else 0
         for shape, dtype in zip(self.shapes, self.dtypes, strict=True):
@@ -65,7 +65,7 @@ def columns_of_values(tree: Any, lanes: Lanes) -> list[jax.Array]:
 
 
 def columns_of_arrays(tree: Any) -> list[jax.Array]:
-    """Of arrays with the trajectories in front."""
+    """Return the columns of arrays with the trajectories in front."""
     flat = lambda leaf: leaf.reshape(leaf.shape[0], math.prod(leaf.shape[1:]))
     return [column for leaf in jtu.tree_leaves(tree) for column in flat(leaf).T]
 

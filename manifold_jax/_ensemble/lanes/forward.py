@@ -50,7 +50,8 @@ class Tangents:
         return Given(each, rest, tangent, given.direction)
 
     def _along(self, function: Any, given: Given, x: Any, dx: Any) -> tuple[Any, Any, Any]:
-        """Of `function(equations, given, x) -> (smooth, aux)`: `smooth`, its tangent, `aux`."""
+        """Differentiate along a tangent, of `function(equations, given, x) -> (smooth, aux)`:
+        `smooth`, its tangent, `aux`."""
 
         def value(each: Any, common: Any, x: Any) -> Any:
             return function(*self.parts.one(each, common, given.rest), x)
@@ -110,7 +111,8 @@ class Tangents:
 
 
 def tangents_in_lanes(inputs: Inputs, tangents: Any, lanes: int, limit: int) -> tuple[Any, Any]:
-    """Of times and values; `tangents` of the inputs have `None` where there is none."""
+    """Return the tangents of times and values; `tangents` of the inputs have `None` where there is
+    none."""
     is_none = lambda x: x is None
     differentiated = jtu.tree_map(lambda x: x is not None, tangents, is_leaf=is_none)
     parts = Parts.of(inputs, differentiated)

@@ -21,7 +21,7 @@ def smooth_of(trajectory: Trajectory) -> Any:
 
 
 class Functions:
-    """Of `(each, common, rest_each)`, see [`Parts`][], and what their names say."""
+    """Functions of `(each, common, rest_each)`, see [`Parts`][], and what their names say."""
 
     def __init__(self, parts: Parts, solver_state: Any):
         """`solver_state`: an example."""

@@ -117,7 +117,7 @@ def _backward(run, cotangents, perturbed, inputs, lanes):
 
 @eqx.filter_custom_jvp
 def solve_in_lanes_forwards(inputs: Inputs, lanes: int) -> EnsembleSolution:
-    """With forward mode instead."""
+    """Solve in lanes, differentiated in forward mode."""
     solution, _ = _run(inputs, lanes)
     return solution
 

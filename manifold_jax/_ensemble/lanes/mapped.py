@@ -42,7 +42,8 @@ def solve_mapped(inputs: Inputs, lanes: int) -> EnsembleSolution:
 
 
 def gradient_of_mapped(inputs: Inputs, differentiated: Any, bar: Any, lanes: int) -> Any:
-    """From the cotangents of times and values, each trajectory by the reverse sweep of `diffeqsolve`."""
+    """Return the gradient from the cotangents of times and values, each trajectory by the reverse
+    sweep of `diffeqsolve`."""
     smooth, rest = eqx.partition(inputs, differentiated)
 
     def saved(smooth: Any) -> Any:
@@ -55,7 +56,8 @@ def gradient_of_mapped(inputs: Inputs, differentiated: Any, bar: Any, lanes: int
 
 
 def tangents_of_mapped(inputs: Inputs, tangents: Any, lanes: int) -> Any:
-    """Of times and values; `tangents` of the inputs have `None` where there is none."""
+    """Return the tangents of times and values; `tangents` of the inputs have `None` where there is
+    none."""
 
     def saved(inputs: Inputs) -> Any:
         solution = solve_mapped(inputs, lanes)

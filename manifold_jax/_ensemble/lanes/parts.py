@@ -40,7 +40,7 @@ class Parts(NamedTuple):
         return equations, dataclasses.replace(batch, each=eqx.combine(each, self.rest_each))
 
     def together(self, each: Any, common: Any) -> Inputs:
-        """Of the structure of the inputs, without what is not differentiated."""
+        """Return a tree of the structure of the inputs, without what is not differentiated."""
         equations, batch = common
         return equations, dataclasses.replace(batch, each=each)
 
@@ -49,7 +49,7 @@ class Parts(NamedTuple):
 
 
 def in_steps(equations: Equations) -> Equations:
-    """With the solver as it is in the loop over steps."""
+    """Return the equations with the solver as it is in the loop over steps."""
     solver = equations.solver.within(equations.controller, bends_interpolant=False)
     return dataclasses.replace(equations, solver=solver)
 

@@ -9,7 +9,8 @@ from .trajectory import Trajectory
 
 
 class Ends(NamedTuple):
-    """Of all trajectories, in front of every array: the states they begin with, numbers of steps and of
+    """The ends of all trajectories, in front of every array: the states they begin with, numbers
+    of steps and of
     saved rows, and the table of states there (see [`Run`][]); cotangents of the first and the last
     states and of the values at `ts`."""
 
@@ -44,7 +45,8 @@ class Bars(NamedTuple):
 
 
 class Record(NamedTuple):
-    """Of the steps of a segment: where they begin and end, from which state; which were accepted."""
+    """A record of the steps of a segment: where they begin and end, from which state; which were
+    accepted."""
 
     steps: dict[str, Array]
     accepted: Array

@@ -131,7 +131,7 @@ class WayBack:
         return group._replace(at_times=at_times), bars
 
     def _through_segments(self, group: Group, bars: Bars, record: Record) -> tuple[Bars, Record]:
-        """On to the last one, storing where each begins, and back."""
+        """Go forwards to the last segment, storing where each begins, and back."""
         state, dtypes = taken(self.starts, group.index), self.state_layout.dtypes_of_columns()
         segments = -(-self.max_steps // self.rows)
         room = lambda x: jnp.zeros((segments, *x.shape), x.dtype).at[0].set(x)

@@ -38,7 +38,8 @@ class Lane(NamedTuple):
 
 
 class Totals(NamedTuple):
-    """Of all trajectories columns of the outcomes so far, how many times to save at were reached, and
+    """What is known of all trajectories: columns of the outcomes so far, how many times to save at
+    were reached, and
     the table of states there; the next trajectory to take, and how many have ended."""
 
     outcomes: list[Array]
@@ -131,7 +132,7 @@ class Schedule:
         return [flat(x) for x in starts], flat(correction), layout  # pyright: ignore[reportReturnType]
 
     def _layouts(self, state_layout: Layout) -> tuple[Layout, Layout]:
-        """Of outcomes and of states."""
+        """Return the layouts of outcomes and of states."""
         given, trajectory = self.given_layout.example(), state_layout.example()
         outcome = lambda given, trajectory: self.equations.outcome(self.complete(given), trajectory)
         outcomes = Layout.of(jax.eval_shape(outcome, given, trajectory))

@@ -22,7 +22,7 @@ from ..._solve.outcome import (
 
 
 class EnsembleSolution(eqx.Module):
-    """Of `N` trajectories, in the order of the initial values.
+    """The solutions of `N` trajectories, in the order of the initial values.
 
     - `ts`: the times of what was saved, `(N, T)`; infinite where a trajectory did not get there, and with
       `SaveAt(t1=True)` the time at which it stopped: see `failed`.

@@ -63,7 +63,7 @@ class Attempt(NamedTuple):
 
 
 class Outcome(NamedTuple):
-    """Of a trajectory that has ended."""
+    """The outcome of a trajectory that has ended."""
 
     t: FloatScalar
     y: Y

@@ -93,12 +93,13 @@ def named(values: Any) -> list[tuple[str, Any]]:
 
 
 def fingerprint_of_attributes(attributes: dict[str, Any]) -> str:
-    """Of what this library has written there; others may add to it."""
+    """Return a fingerprint of what this library has written there; others may add to it."""
     return _fingerprint([attributes.get(name) for name in ("settings", "messages", "files")])
 
 
 def fingerprint_of_description(description: dict[str, Any]) -> str:
-    """Of a file `zarr.json`, but for the attributes, which are free for others."""
+    """Return a fingerprint of a file `zarr.json`, but for the attributes, which are free for
+    others."""
     added = ("attributes", "consolidated_metadata")
     return _fingerprint({name: x for name, x in description.items() if name not in added})
 

@@ -13,7 +13,8 @@ _MOST = 5
 
 
 class Fault(NamedTuple):
-    """Of one file: its name in the folder, what is wrong, and the number of the chunk it has, `None`
+    """A fault of one file: its name in the folder, what is wrong, and the number of the chunk it
+    has, `None`
     for a description."""
 
     file: str
@@ -43,7 +44,8 @@ def described(path: Path) -> dict[str, Any] | None:
 
 
 def faults_of_descriptions(path: Path, attributes: dict[str, Any]) -> list[Fault]:
-    """Of the files `zarr.json` of groups and arrays, without which theirs cannot be read. Before the
+    """Return the faults of the files `zarr.json` of groups and arrays, without which theirs cannot
+    be read. Before the
     first chunk they are still being written."""
     out = []
     for name, fingerprint in attributes["files"].items():
@@ -57,7 +59,8 @@ def faults_of_descriptions(path: Path, attributes: dict[str, Any]) -> list[Fault
 
 
 def faults_of_chunks(group: Any) -> list[Fault]:
-    """Of those that have been computed, each of which is read. The last may be unfinished: `result`
+    """Return the faults of those chunks that have been computed, each of which is read. The last
+    may be unfinished: `result`
     is its last array."""
     root, arrays = group.store.root, _arrays(group)
     there = {name: _chunks_there(root, name, array) for name, array in arrays.items()}

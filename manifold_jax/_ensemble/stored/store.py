@@ -95,7 +95,7 @@ class StoredEnsemble:
         return out
 
     def failures_by_reason(self, most: int = 3) -> dict[str, tuple[int, list[int]]]:
-        """For each reason how many failed, and the numbers of the first."""
+        """Return for each reason how many failed, and the numbers of the first."""
         counts: dict[int, int] = {}
         first: dict[int, list[int]] = {}
         for start, codes in self._codes():

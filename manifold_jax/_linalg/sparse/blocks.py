@@ -25,7 +25,8 @@ class Pivot(NamedTuple):
 
     @staticmethod
     def of(A: Float[Array, "*b w w"]) -> "Pivot":
-        """In the place of `A`, as Gauss-Jordan elimination, which also forms the product."""
+        """Invert a block in the place of `A`, as Gauss-Jordan elimination, which also forms the
+        product."""
         width = A.shape[-1]
         if width <= _WRITTEN_OUT:
             return _entry_by_entry(A)

@@ -23,7 +23,8 @@ _ONE_LOOP = 64
 
 
 class Blocks(NamedTuple):
-    """Of a block tridiagonal matrix, `lower[b]` beside `diagonal[b]` to the left of it, `upper[b]` to
+    """The blocks of a block tridiagonal matrix, `lower[b]` beside `diagonal[b]` to the left of it,
+    `upper[b]` to
     the right. The first lower and the last upper one are zero."""
 
     lower: Float[Array, "b w w"]
@@ -44,7 +45,7 @@ def eliminate(blocks: Blocks) -> "Tridiagonal | InOneLoop | InChunks":
 
 
 class Tridiagonal(eqx.Module):
-    """By the library (LAPACK, cuSPARSE), with row exchanges."""
+    """Elimination by the library (LAPACK, cuSPARSE), with row exchanges."""
 
     blocks: Blocks
 

@@ -15,7 +15,8 @@ from .structure import Structure
 
 
 class BlockFactorization(eqx.Module):
-    """With a flag that says whether a system with a known solution is solved to some digits: not if
+    """A factorization with a flag that says whether a system with a known solution is solved to
+    some digits: not if
     the rank is not full, nor if an entry is missing in the structure.
 
     The derivative is that of `G V x = b`, whatever the elimination does.
@@ -74,7 +75,7 @@ class BlockFactorization(eqx.Module):
 
     @property
     def lengths(self) -> Float[Array, " m"]:
-        """Of the gradients, in the metric of the directions."""
+        """Return the lengths of the gradients, in the metric of the directions."""
         structure = self.structure
         diagonal = jnp.diagonal(self.blocks.diagonal, axis1=1, axis2=2).reshape(-1)
         diagonal = diagonal[: structure.num_equations]
@@ -83,7 +84,7 @@ class BlockFactorization(eqx.Module):
         return jnp.sqrt(jnp.where(diagonal > 0, diagonal, 1))
 
     def _is_right(self, product: Any) -> BoolScalar:
-        """Of a system with a known solution: equations of any units."""
+        """Test the solution of a system with a known solution: equations of any units."""
         lengths = self.lengths
         mixed = jnp.arange(lengths.size, dtype=jnp.uint32) * jnp.uint32(2654435769)
         known = jnp.where(mixed >> 31 == 0, 1, -1).astype(lengths.dtype)  # signs without a pattern
@@ -100,7 +101,8 @@ def _fixed(rows: Any) -> Any:
 
 
 def _places(structure: Structure) -> Array:
-    """Of the equations in the order of elimination. Behind a barrier, as the compiler would evaluate
+    """Return the places of the equations in the order of elimination. Behind a barrier, as the
+    compiler would evaluate
     what follows from it by itself, slowly."""
     if structure.place is None:
         return jax.lax.optimization_barrier(jnp.arange(structure.num_equations, dtype=jnp.int32))
@@ -108,7 +110,7 @@ def _places(structure: Structure) -> Array:
 
 
 def _blocks(product: Any, structure: Structure, dtype: Any) -> Blocks:
-    """Of every third block one column at a time: three colors of blocks do not meet."""
+    """Compute of every third block one column at a time: three colors of blocks do not meet."""
     width, groups = structure.width, structure.num_blocks // 3
     places = _places(structure)
     wanted = jnp.arange(3 * width, dtype=jnp.int32)[:, None]

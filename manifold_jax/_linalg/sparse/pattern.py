@@ -23,7 +23,8 @@ _FULL = 0.25
 
 
 def dependence(function: Callable, x: Float[Array, " n"]) -> sp.csr_matrix | None:
-    """Of `function(x)`, a vector: `(m, n)` with a one where equation `i` depends on unknown `j`, for
+    """Return the dependence of `function(x)`, a vector: `(m, n)` with a one where equation `i`
+    depends on unknown `j`, for
     any values. `None` if most equations depend on very many."""
     n = x.size
     if n <= _GROUPS * _HASHES:

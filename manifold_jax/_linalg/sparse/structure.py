@@ -23,7 +23,8 @@ _WIDEST = 1 / 6
 
 
 class Structure:
-    """Of `m` equations in `n` unknowns, of which `per_block` neighbours have masses that are coupled.
+    """The sparsity structure of `m` equations in `n` unknowns, of which `per_block` neighbours
+    have masses that are coupled.
 
     - `order`: of the equations, in which `C M^-1 C^T` is block tridiagonal, and `place` of each of
         them in it; `None` if it is their own.
@@ -50,7 +51,7 @@ class Structure:
         return per_block, shape, depends.indptr.tobytes(), depends.indices.tobytes()
 
     def __eq__(self, other: object) -> bool:
-        """By contents: a structure that is found again is the same static field."""
+        """Compare by contents: a structure that is found again is the same static field."""
         return isinstance(other, Structure) and self._contents == other._contents
 
     def __hash__(self) -> int:
@@ -66,7 +67,7 @@ class Structure:
 
     @property
     def num_blocks(self) -> int:
-        """With those that make it a multiple of three, for three colors."""
+        """The number of blocks with those that make it a multiple of three, for three colors."""
         return 3 * -(-self.num_equations // (3 * self.width))
 
 
@@ -123,7 +124,8 @@ _MOST_FOUND = 64
 
 
 def structure_of(equations: Any, per_block: int = 1) -> Structure | None:
-    """As for `choose_structure`, if there is any. Found once for each traced program, which is
+    """Return the structure as for `choose_structure`, if there is any. Found once for each traced
+    program, which is
     evaluated in many places."""
     key = per_block, *(_program(function, x) for function, x in equations)
     if key not in _FOUND:

@@ -50,7 +50,7 @@ class AbstractExecution(eqx.Module):
         y0: Y,
         args: Args,
     ) -> Any:
-        """Before the first step."""
+        """Return the memory before the first step."""
 
     @abc.abstractmethod
     def step(

@@ -97,7 +97,8 @@ def with_accurate_stages(solver: dfx.AbstractSolver) -> dfx.AbstractSolver:
 def with_tolerances_of_stages(
     solver: Any, controller: dfx.AbstractStepSizeController, y0: Y
 ) -> Any:
-    """With constant steps there are no tolerances of the steps that stages could inherit. They are
+    """Return a solver whose stages have tolerances. With constant steps there are no tolerances of
+    the steps that stages could inherit. They are
     solved to round-off in any case, and count as solved where half of the digits are right."""
     if isinstance(controller, dfx.AbstractAdaptiveStepSizeController):
         return solver

@@ -146,7 +146,8 @@ class Case:
         return _weighted_sum(end), end, residual
 
     def exact_gradient(self) -> np.ndarray | None:
-        """Of the exact solution instead, by differences of it; `None` where it is not known."""
+        """The gradient of the exact solution instead, by differences of it; `None` where it is not
+        known."""
 
         def value(theta: np.ndarray) -> float:
             y = self.problem_at(jnp.asarray(theta)).reference(self.t1)

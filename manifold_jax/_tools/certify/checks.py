@@ -183,7 +183,7 @@ def _hessian_difference(
 
 
 def _gradient(case: Case, name: str, adjoint: dfx.AbstractAdjoint) -> Callable[[Any], Any]:
-    """As users compute it: the steps are chosen anew."""
+    """Return the gradient as users compute it: the steps are chosen anew."""
     transform = jax.jacfwd if name == "forward" else jax.grad
     return transform(lambda theta: case.objective(theta, adjoint, case.adaptive))
 

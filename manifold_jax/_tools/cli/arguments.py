@@ -52,7 +52,7 @@ def task_for(
 def choose(
     names: str | None, known: dict[str, "Way"], task: "Task"
 ) -> tuple[list["Way"], list["Way"]]:
-    """Of the methods asked for, those that can solve the task, and those that cannot."""
+    """Choose, of the methods asked for, those that can solve the task, and those that cannot."""
     asked = list(known) if names is None else names_in(names, known, "method", "--methods")
     methods = [method for name, method in known.items() if name in asked]
     chosen = [m for m in methods if m.needs is None or m.needs.is_met_by(task.problem)]

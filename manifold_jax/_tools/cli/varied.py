@@ -20,7 +20,7 @@ from .arguments import check_name
 
 
 class Distribution(NamedTuple):
-    """Of one number: its name, the kind, and the two numbers that describe it."""
+    """The distribution of one number: its name, the kind, and the two numbers that describe it."""
 
     target: str
     kind: str
@@ -49,7 +49,8 @@ _HINT = "--vary"
 
 
 def distributions(texts: list[str], problem: Problem) -> list[Distribution]:
-    """Of `NAME=KIND(A,B)` each, or an error that says what could have been asked for."""
+    """Read a distribution of `NAME=KIND(A,B)` each, or an error that says what could have been
+    asked for."""
     known = list(_places(problem))
     out: list[Distribution] = []
     for text in texts:
@@ -113,7 +114,7 @@ class VariedProblem:
         )
 
     def __repr__(self) -> str:
-        """As the settings of the folder have it."""
+        """Show the problem as the settings of the folder have it."""
         return f"{self.problem.name} with {', '.join(map(str, self.varied))}"
 
     def sample(self, index: Array, key: Array) -> tuple[Any, Given]:
@@ -167,7 +168,7 @@ class ConstraintInArgs(AbstractConstraint):
 
 
 class _Place(NamedTuple):
-    """Of a number in a tree of arrays."""
+    """The place of a number in a tree of arrays."""
 
     leaf: int
     index: tuple[int, ...]
@@ -175,7 +176,7 @@ class _Place(NamedTuple):
 
 
 def _places(problem: Problem) -> dict[str, _Place]:
-    """Of every number that can be varied, by name: `args.length`, `y0.0.1`."""
+    """Return the places of every number that can be varied, by name: `args.length`, `y0.0.1`."""
     return {**_places_in("args", problem.args), **_places_in("y0", problem.y0)}
 
 
