@@ -1,3 +1,31 @@
+"""From the residuals of a DAE to a vector field on a manifold, by Pryce's structural analysis.
+
+A pendulum, `F(t, x, x', args)` with the unknowns `x, y, u, v, lambda`, as an example:
+
+    A: x' - u = 0                C: u' + lambda x = 0            E: x^2 + y^2 - 1 = 0
+    B: y' - v = 0                D: v' + lambda y + g = 0
+
+- `equations.py`, `occurrence.py`: which derivative of which unknown is in which equation, found from
+  the function. The signature matrix has the highest ones (`-` where an unknown is absent):
+
+          x  y  u  v  lambda   c
+      A   1  -  0  -    -      1
+      B   -  1  -  0    -      1
+      C   0  -  1  -    0      0
+      D   -  0  -  1    0      0
+      E   0  0  -  -    -      2
+      d   2  2  1  1    0
+
+- `signature.py`: the smallest offsets with `d_j - c_i >= sigma_ij`: A and B are differentiated once, E
+  twice, which leaves sum(d) - sum(c) = 2 degrees of freedom; the index is 3.
+- `aliases.py`, `combined.py`: unknowns that are others under another name, equations from which derivatives
+  cancel, so that the analysis is about what is left.
+- `pivots.py`, `layout.py`: which derivatives are states, and where each number is.
+- `highest_derivatives.py`: the linear equations for `x'', y'', u', v', lambda`: the vector field.
+- `constraint.py`: E, its first derivative, and A, B where they are not eliminated: the manifold.
+- `initial.py`, `nearest.py`: consistent starts. `system.py`, `report.py`: what `reduce_dae` returns.
+"""
+
 from .reduce import reduce_dae as reduce_dae
 from .report import DAEReport as DAEReport
 from .system import ReducedDAE as ReducedDAE

@@ -16,7 +16,7 @@ from ..._solver.unconstrained import Unconstrained
 from .forward import tangents_in_lanes
 from .mapped import gradient_of_mapped, tangents_of_mapped
 from .parts import in_steps, Inputs, Parts, times_are_differentiated
-from .reverse import Ends, WayBack
+from .reverse import Ends, ReverseSweep
 from .rows import saved_rows
 from .schedule import Run, Schedule
 from .solution import EnsembleSolution
@@ -49,7 +49,7 @@ def gradient_in_lanes(
     bar = jtu.tree_map(lambda x, b: jnp.zeros_like(x) if b is None else b, rows, bar)
     each, common, *bars = pullback(bar)
     ends = Ends(run.start.trajectory, run.outcome.num_steps, run.rows, run.states, *bars)
-    more = WayBack(parts, ends, lanes, limit).run()
+    more = ReverseSweep(parts, ends, lanes, limit).run()
     each, common = jtu.tree_map(jnp.add, (each, common), more)
     return parts.together(each, common)
 

@@ -35,7 +35,7 @@ from .records import Bars, Ends, Group, Record
 _BYTES = 2**22
 
 
-class WayBack:
+class ReverseSweep:
     def __init__(self, parts: Parts, ends: Ends, lanes: int, limit: int):
         self.parts, self.ends = parts, ends
         self.functions = Functions(parts, jtu.tree_map(lambda x: x[0], ends.start.solver_state))
