@@ -196,9 +196,7 @@ def test_every_approach_and_an_ensemble(reduced):
     many = {**args, "g": jnp.array([5.0, args["g"]])}
     settings = {"args_axes": {"g": 0, "m": None, "L": None}, "stepsize_controller": control}
     starts = jnp.tile(start, (2, 1))
-    ensemble = mj.solve_ensemble(
-        dae.terms, hooks[0], *problem, starts, many, **settings, args_axes=0
-    )
+    ensemble = mj.solve_ensemble(dae.terms, hooks[0], *problem, starts, many, **settings)
     np.testing.assert_allclose(ensemble.ys[1, -1], exact, rtol=0, atol=1e-6)
 
 

@@ -10,7 +10,7 @@ from jaxtyping import Array
 
 from ..._adjoint.replay import with_memory
 from ..._base.types import BoolScalar, FloatScalar
-from .functions import smooth_of
+from .functions import smooth_part, step_state
 from .parts import in_steps, Inputs, Parts
 from .rows import saved_rows
 from .schedule import Run, Schedule
@@ -62,7 +62,7 @@ class Tangents:
     def begin(self, given: Given) -> Start:
         def begin(equations, given, _):
             start = equations.begin(given)
-            return smooth_of(start.trajectory), start
+            return smooth_part(step_state(start.trajectory)), start
 
         _, tangent, start = self._along(begin, given, None, None)
         return start._replace(trajectory=Moving(start.trajectory, tangent))
@@ -73,16 +73,15 @@ class Tangents:
 
     def attempt(self, given: Given, moving: Moving) -> Attempt:
         before = moving.trajectory
+        smooth, discrete = eqx.partition(step_state(before), eqx.is_inexact_array)
 
         def attempt(equations, given, smooth):
-            y, memory = smooth
+            y, memory = eqx.combine(smooth, discrete)
             state = with_memory(before.solver_state, memory)
             tried = equations.attempt(given, before._replace(y=y, solver_state=state))
-            return (smooth_of(tried.trajectory), tried.dense_info), tried
+            return (smooth_part(step_state(tried.trajectory)), tried.dense_info), tried
 
-        _, (tangent, dense_tangent), tried = self._along(
-            attempt, given, smooth_of(before), moving.tangent
-        )
+        _, (tangent, dense_tangent), tried = self._along(attempt, given, smooth, moving.tangent)
         after = Moving(tried.trajectory, tangent)
         return tried._replace(trajectory=after, dense_info=(tried.dense_info, dense_tangent))
 

@@ -15,9 +15,14 @@ from .parts import Parts
 from .trajectory import Attempt, Trajectory
 
 
-def smooth_of(trajectory: Trajectory) -> Any:
-    """What of it a step has derivatives with respect to, and depends on at all."""
+def step_state(trajectory: Trajectory) -> Any:
+    """Return what a step depends on: the state, and what the solver remembers."""
     return trajectory.y, memory_of(trajectory.solver_state)
+
+
+def smooth_part(step_state: Any) -> Any:
+    """Return the leaves with respect to which a step has derivatives; the others are `None`."""
+    return eqx.filter(step_state, eqx.is_inexact_array)
 
 
 class Functions:
@@ -45,19 +50,20 @@ class Functions:
 
         def start(each: Any, common: Any) -> Any:
             equations, given = self.parts.one(each, common, rest)
-            return smooth_of(equations.begin(given).trajectory)
+            return smooth_part(step_state(equations.begin(given).trajectory))
 
         return jax.vjp(start, each, common)[1](bar)
 
     def step(
         self, each: Any, common: Any, rest: Any, start: FloatScalar, end: FloatScalar, state: Any
     ) -> tuple[Any, Callable]:
-        """The data of the interpolation in a step, and what takes cotangents of the state behind it
-        and of these data to those of `each`, `common` and `state`."""
+        """The data of the interpolation in a step, and what takes cotangents of the smooth part of
+        the state behind it and of these data to those of `each`, `common` and `state`."""
+        smooth, discrete = eqx.partition(state, eqx.is_inexact_array)
 
-        def step(each: Any, common: Any, state: Any) -> Any:
+        def step(each: Any, common: Any, smooth: Any) -> Any:
             equations, given = self.parts.one(each, common, rest)
-            y, memory = state
+            y, memory = eqx.combine(smooth, discrete)
             y, _, dense_info, solver_state, _ = equations.solver.step(
                 directed(equations.terms, given.direction),
                 start,
@@ -67,9 +73,9 @@ class Functions:
                 with_memory(self.solver_state, memory),
                 False,
             )
-            return (y, memory_of(solver_state)), dense_info
+            return smooth_part((y, memory_of(solver_state))), dense_info
 
-        (_, dense_info), pullback = jax.vjp(step, each, common, state)
+        (_, dense_info), pullback = jax.vjp(step, each, common, smooth)
         return dense_info, pullback
 
     def through_interpolated(

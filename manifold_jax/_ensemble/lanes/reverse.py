@@ -26,7 +26,7 @@ from .columns import (
     unstacked,
     where,
 )
-from .functions import Functions, smooth_of
+from .functions import Functions, smooth_part, step_state
 from .parts import Parts
 from .records import Bars, Ends, Group, Record
 
@@ -46,7 +46,9 @@ class ReverseSweep:
             Layout.of_one(x) for x in (parts.each, parts.rest_each)
         )
         self.starts, self.state_layout = columns_of_arrays(ends.start), Layout.of_one(ends.start)
-        self.smooth_layout = Layout.of_one(smooth_of(ends.start))
+        remembered = step_state(ends.start)
+        self.step_layout = Layout.of_one(remembered)
+        self.smooth_layout = Layout.of_one(smooth_part(remembered))
         self.y_layout = Layout.of_one(ends.start.y)
         self.firsts, self.first_bar, self.last_bar = (
             columns_of_arrays(x) for x in (ends.start.y, ends.first_bar, ends.last_bar)
@@ -82,7 +84,7 @@ class ReverseSweep:
 
     def _empty_record(self) -> Record:
         time = self.ends.start.tprev.dtype
-        self.record_dtypes = [time, time, *self.smooth_layout.dtypes_of_columns()]
+        self.record_dtypes = [time, time, *self.step_layout.dtypes_of_columns()]
         one = stacked([jnp.zeros(self.lanes.count, dtype) for dtype in self.record_dtypes])
         rows = max(_BYTES // sum(x.nbytes for x in one.values()), 1)
         self.rows = min(rows, self.max_steps)
@@ -165,7 +167,7 @@ class ReverseSweep:
             with self.lanes.inside(state[0]):
                 before = self.state_layout.values(state)
                 tried = self._call(self.functions.attempt, group, before)
-                x = columns_of_values((before.tprev, before.tnext, smooth_of(before)), self.lanes)
+                x = columns_of_values((before.tprev, before.tnext, step_state(before)), self.lanes)
                 accepted = active & self._column(tried.kept)
                 record = record.with_row(row, x, accepted)
                 state = where(active, columns_of_values(tried.trajectory, self.lanes), state)
@@ -196,7 +198,7 @@ class ReverseSweep:
     ) -> Bars:
         layout = Layout.of(self.ends.start.tprev[0])
         start, end = (layout.values([x]) for x in columns[:2])
-        state = self.smooth_layout.values(columns[2:])
+        state = self.step_layout.values(columns[2:])
         dense_info, pullback = self._call(self.functions.step, group, start, end, state)
         if self.ts is None:
             zero = lambda value: Value.of_constant(jnp.zeros(value.shape, value.dtype))
