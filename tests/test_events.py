@@ -74,6 +74,15 @@ def test_gradient_of_time_and_state_of_an_event(hook):
     assert reverse[0] == 0
 
 
+@pytest.mark.parametrize("solver", [dfx.Tsit5(), mj.Rodas3P()], ids=["plain", "rosenbrock"])
+def test_events_without_a_hook_see_the_true_time_backwards(solver):
+    """Diffrax alone shows them -2 at the start, and ends there."""
+    event = dfx.Event(lambda t, y, args, **kwargs: t - 1.03, optx.Newton(1e-10, 1e-10))
+    field = dfx.ODETerm(lambda t, y, args: -y)
+    sol = mj.diffeqsolve(field, solver, 2.0, 0.0, -0.1, jnp.ones(1), event=event)
+    np.testing.assert_allclose(sol.ts[0], 1.03, rtol=1e-12)
+
+
 def nowhere_for_a_while(t, y, args):
     """No state satisfies it between the ends of two steps."""
     return y @ y - 1.0 + jnp.where((t > 0.28) & (t < 0.32), 5.0, 0.0)

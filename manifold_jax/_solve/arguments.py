@@ -185,6 +185,19 @@ def warn_of_rounding(y0: Y, time: Any, controller: Any) -> None:
         )
 
 
+def warn_of_unknown_hook(solver: dfx.AbstractSolver) -> None:
+    if isinstance(solver, dfx.HalfSolver) or not isinstance(solver, dfx.AbstractWrappedSolver):
+        return
+    name = type(solver).__name__
+    warnings.warn(
+        f"`solver` is a {name}, a wrapper of your own: `mj.diffeqsolve` does not know its constraint, and corrects "
+        "neither `y0` nor values between steps (`SaveAt(ts=)`, events, the dense solution). Write "
+        f"`mj.Projected({name}(...), constraint)`, derive it from `mj.AbstractManifoldSolver`, or call "
+        "`diffrax.diffeqsolve`.",
+        stacklevel=2,
+    )
+
+
 def raise_if_unstable(y0: Y, terms: Any, solver: dfx.AbstractSolver, dt0: RealScalarLike) -> Y:
     """Refuse constant steps with which stabilization makes violations grow."""
     stabilized = isinstance(solver, Stabilized)

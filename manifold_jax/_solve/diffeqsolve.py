@@ -11,22 +11,22 @@ from .._base.numbers import numbers_as_arrays
 from .._base.types import Args, RealScalarLike, Y
 from .._base.user_functions import evaluated
 from .._solver.base import AbstractManifoldSolver
-from .._solver.step.implicit import with_tolerances_of_stages
+from .._solver.step.implicit import with_accurate_stages, with_tolerances_of_stages
 from .arguments import (
     check_arguments,
     check_max_steps,
     explained,
     raise_if_unstable,
     warn_of_rounding,
+    warn_of_unknown_hook,
     without_idle_hook,
 )
 from .finish import finish
 from .mass_matrix import trusting
-from .output import events_in_true_time, on_manifold_saving
+from .output import events_in_true_time, saving
 from .prepare import prepare, time_dtype
-from .start import Consistent
+from .setup import Consistent, Given, Setup
 from .times import checking_first_step, refusing_missing_times
-from .without_hook import solve_without_hook
 
 
 @clear_errors
@@ -110,60 +110,54 @@ def diffeqsolve(
     check_arguments(terms, solver, dt0, saveat, stepsize_controller, adjoint, event, consistent)
     check_max_steps(max_steps)
     warn_of_rounding(y0, time_dtype(t0, t1, dt0, saveat), stepsize_controller)
-    given: Any = solver
+    constraint = getattr(solver, "constraint", None)
     if isinstance(solver, AbstractManifoldSolver):
         terms, solver = evaluated((terms, solver), args)
     solver = without_idle_hook(solver, t0, y0, args)
+    if throw and isinstance(stepsize_controller, dfx.ConstantStepSize) and dt0 is not None:
+        y0 = raise_if_unstable(y0, terms, solver, dt0)
+    solver = _as_in_steps(solver, stepsize_controller, event, consistent, y0)
+    setup = Setup(terms, solver, dt0, saveat, stepsize_controller, consistent, throw, event)
+    ready = prepare(setup, Given(t0, t1, y0, args))
+    t0, t1, y0, _ = ready.given
     adjoint = CheckedStartAdjoint(adjoint)
     if event is not None and event.root_finder is not None:
         adjoint = LocatingAdjoint(adjoint)
-    options = dict(
+    sol = dfx.diffeqsolve(
+        terms,
+        solver,
+        t0,
+        t1,
+        ready.dt0,
+        y0,
+        args,
+        saveat=saving(setup),
         stepsize_controller=stepsize_controller,
         adjoint=adjoint,
+        event=events_in_true_time(setup, ready),
         max_steps=max_steps,
+        throw=False,
         progress_meter=progress_meter,
+        solver_state=ready.solver_state if solver_state is None else solver_state,
         controller_state=controller_state,
         made_jump=made_jump,
     )
-    if throw and isinstance(stepsize_controller, dfx.ConstantStepSize) and dt0 is not None:
-        y0 = raise_if_unstable(y0, terms, solver, dt0)
-    if not isinstance(solver, AbstractManifoldSolver):
-        return solve_without_hook(
-            terms,
-            solver,
-            t0,
-            t1,
-            dt0,
-            y0,
-            args,
-            saveat,
-            throw,
-            consistent,
-            event=event,
-            solver_state=solver_state,
-            **options,
-        )
-    bends_interpolant = event is not None  # every interpolated value is corrected otherwise
-    hook: AbstractManifoldSolver = trusting(
-        solver.within(stepsize_controller, bends_interpolant), consistent
-    )
-    hook = with_tolerances_of_stages(hook, stepsize_controller, y0)
-    ready = prepare(
-        terms, hook, t0, t1, dt0, y0, args, saveat, stepsize_controller, consistent, throw
-    )
-    sol = dfx.diffeqsolve(
-        terms,
-        hook,
-        ready.t0,
-        ready.t1,
-        ready.dt0,
-        ready.y0,
-        args,
-        saveat=on_manifold_saving(saveat, hook, event),
-        event=events_in_true_time(event, terms, ready.t0, ready.t1, ready.dt0),
-        throw=False,
-        solver_state=ready.solver_state if solver_state is None else solver_state,
-        **options,
-    )
     # The dense solution, which is returned, holds the constraint that was given.
-    return finish(sol, hook, given, saveat, event, ready.y0, args, ready.start, throw)
+    return finish(setup, ready, sol, constraint)
+
+
+def _as_in_steps(
+    solver: Any,
+    controller: dfx.AbstractStepSizeController,
+    event: dfx.Event | None,
+    consistent: Consistent,
+    y0: Y,
+) -> Any:
+    """The solver as it runs: with the tolerances of the controller, and accurate implicit stages."""
+    if isinstance(solver, AbstractManifoldSolver):
+        # Every value that is interpolated is corrected, but for those that an event is searched by.
+        solver = solver.within(controller, bends_interpolant=event is not None)
+    else:
+        warn_of_unknown_hook(solver)
+        solver = with_accurate_stages(solver)
+    return with_tolerances_of_stages(trusting(solver, consistent), controller, y0)

@@ -1,85 +1,82 @@
 """What is done after the loop: output on the manifold, statistics, and the result."""
 
+from typing import Any
+
 import diffrax as dfx
+import equinox as eqx
 from diffrax import RESULTS
 
 from .._base.compat import is_okay, nonlinear_failure, update_result
-from .._base.types import Args, Y
+from .._constraint.constraint import AbstractConstraint
+from .._rosenbrock import MassMatrixTerm
 from .._solver.base import AbstractManifoldSolver
 from .._solver.interpolation import ManifoldInterpolation
 from .outcome import raise_if_failed, result_of_saved, tangency_fault
-from .output import project_output
-from .start import StartInfo
+from .output import project_output, saves_state, saving
+from .prepare import Ready
+from .setup import Setup
 
 
 def finish(
-    sol: dfx.Solution,
-    solver: AbstractManifoldSolver,
-    given: AbstractManifoldSolver,
-    saveat: dfx.SaveAt,
-    event: dfx.Event | None,
-    y0: Y,
-    args: Args,
-    start: StartInfo,
-    throw: bool,
+    setup: Setup, ready: Ready, sol: dfx.Solution, constraint: AbstractConstraint | None
 ) -> dfx.Solution:
-    """Correct what was saved, and report; with `throw` raise what went wrong. `saveat` is what was
-    asked for, `given` the solver that the user passed, and `sol.solver_state` has to be there."""
-    statistics = sol.solver_state.statistics  # pyright: ignore[reportOptionalMemberAccess]
-    sol = _corrected(sol, solver, given, saveat, event, y0, args, start)
-    if not throw:
-        return sol
-    faults = tangency_fault(sol.result, solver, statistics, sol.stats["num_accepted_steps"])
+    """Correct what was saved, and report; with `throw` raise what went wrong. `constraint` is held
+    by the dense solution."""
+    is_hook = isinstance(setup.solver, AbstractManifoldSolver)
+    report = _corrected(setup, ready, sol, constraint) if is_hook else _checked(setup, ready, sol)
+    if not setup.throw:
+        return report
+    faults = tangency_fault(setup.solver, report, sol.solver_state)
     # A bad start has raised its own, clearer error.
-    return raise_if_failed(sol, ~is_okay(sol.result) & start.success, solver, faults)
+    failed = ~is_okay(report.result) & ready.start.success
+    return raise_if_failed(report, failed, setup.solver, faults)
 
 
-def _corrected(
-    sol: dfx.Solution,
-    solver: AbstractManifoldSolver,
-    given: AbstractManifoldSolver,
-    saveat: dfx.SaveAt,
-    event: dfx.Event | None,
-    y0: Y,
-    args: Args,
-    start: StartInfo,
-) -> dfx.Solution:
-    ys, failed = project_output(saveat, event, solver, sol.ts, sol.ys, y0, args)
-    failed_output = RESULTS.where(failed, nonlinear_failure(), RESULTS.successful)
+def _corrected(setup: Setup, ready: Ready, sol: dfx.Solution, constraint: Any) -> dfx.Solution:
+    solver, saveat, (_, _, y0, args) = setup.solver, setup.saveat, ready.given
+    statistics = sol.solver_state.statistics  # pyright: ignore[reportOptionalMemberAccess]
+    ys, failed = project_output(setup, ready.given, sol.ts, sol.ys)
     # Diffrax forgets that a step failed if it has an event, too.
     result = update_result(sol.result, sol.solver_state.result)  # pyright: ignore[reportOptionalMemberAccess]
-    result = update_result(result, failed_output)
+    result = update_result(result, RESULTS.where(failed, nonlinear_failure(), RESULTS.successful))
     if not solver.corrects_output:
         result = update_result(result, result_of_saved(saveat, sol.ts, ys))
-    result = RESULTS.where(start.success, result, nonlinear_failure())
-    interpolation = sol.interpolation
+    result = RESULTS.where(ready.start.success, result, nonlinear_failure())
+    interpolation: Any = sol.interpolation
     if interpolation is not None and solver.corrects_output:
         interpolation = ManifoldInterpolation.build(
-            interpolation,
-            given.constraint,
-            solver.projection,
-            sol.t0,  # pyright: ignore[reportArgumentType]
-            y0,
-            args,  # pyright: ignore[reportArgumentType]
+            interpolation, constraint, solver.projection, ready.given.t0, y0, args
         )
-    statistics = sol.solver_state.statistics  # pyright: ignore[reportOptionalMemberAccess]
     stats = {
         **sol.stats,
-        "initial_correction": start.correction,
+        "initial_correction": ready.start.correction,
         "num_projection_iterations": statistics.iterations,
         "largest_correction": statistics.largest_correction,
         "correction_share": statistics.correction_share,
     }
-    return dfx.Solution(
-        t0=sol.t0,
-        t1=sol.t1,
-        ts=sol.ts,
+    solver_state = sol.solver_state if saveat.solver_state else None
+    return _replaced(
+        sol,
         ys=ys,
-        interpolation=interpolation,  # pyright: ignore[reportArgumentType]
+        interpolation=interpolation,
         stats=stats,
         result=result,
-        solver_state=sol.solver_state if saveat.solver_state else None,
-        controller_state=sol.controller_state,
-        made_jump=sol.made_jump,
-        event_mask=sol.event_mask,
+        solver_state=solver_state,
     )
+
+
+def _checked(setup: Setup, ready: Ready, sol: dfx.Solution) -> dfx.Solution:
+    """What Diffrax returns, except that a state that is not finite is no success."""
+    result = update_result(sol.result, result_of_saved(saving(setup), sol.ts, sol.ys))
+    ts, ys = sol.ts, sol.ys
+    if not saves_state(setup.saveat):
+        ts, ys = ts[0], ys[0]  # pyright: ignore[reportOptionalSubscript]
+    stats = sol.stats
+    if isinstance(setup.terms, MassMatrixTerm):
+        stats = {**stats, "initial_correction": ready.start.correction}
+    return _replaced(sol, ts=ts, ys=ys, result=result, stats=stats)
+
+
+def _replaced(sol: dfx.Solution, **fields: Any) -> dfx.Solution:
+    where = lambda s: [getattr(s, name) for name in fields]
+    return eqx.tree_at(where, sol, list(fields.values()), is_leaf=lambda x: x is None)

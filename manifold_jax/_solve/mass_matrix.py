@@ -6,28 +6,27 @@ from typing import Any
 import jax.numpy as jnp
 import jax.tree_util as jtu
 
-from .._base.types import Args, FloatScalar, RealScalarLike, Y
+from .._base.types import FloatScalar, Y
 from .._constraint.diagnosis import Diagnosis
 from .._rosenbrock import AbstractRosenbrock, MassMatrixTerm
 from .._rosenbrock.algebraic import faults_of_start, INCONSISTENT, is_small
-from .start import Consistent
+from .setup import Consistent, Given, Setup
 
 
-def consistent_with_mass(
-    terms: Any, t0: RealScalarLike, y0: Y, args: Args, consistent: Consistent, throw: bool
-) -> tuple[Y, FloatScalar | None]:
+def consistent_with_mass(setup: Setup, given: Given) -> tuple[Y, FloatScalar | None]:
     """The state to start from, and how far it was moved (`None` without a mass matrix). With `throw`
     the error that names the cause is attached to it; otherwise the first step fails for it."""
-    if not isinstance(terms, MassMatrixTerm) or consistent == "assume":
+    terms, (t0, _, y0, args) = setup.terms, given
+    if not isinstance(terms, MassMatrixTerm) or setup.consistent == "assume":
         return y0, None
     start, info = terms.consistent_state(t0, y0, args, throw=False)
     success, correction = info.success, info.correction
     cause, messages = faults_of_start(info)
-    if consistent == "check":
+    if setup.consistent == "check":
         success = info.success & is_small(correction)
         cause = jnp.where(info.success, INCONSISTENT, cause)
         start, correction = y0, jnp.zeros_like(correction)
-    if throw:
+    if setup.throw:
         start = Diagnosis(cause, messages).raise_unless(success, start, "y0")
     return start, correction
 

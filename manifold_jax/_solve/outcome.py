@@ -105,16 +105,13 @@ def is_without_time(number: Any, num_steps: Any) -> Any:
 
 
 def tangency_fault(
-    result: RESULTS,
-    solver: AbstractManifoldSolver,
-    statistics: StepStatistics,
-    num_accepted_steps: IntScalar,
+    solver: dfx.AbstractSolver, sol: dfx.Solution, state: Any
 ) -> list[tuple[BoolScalar, str]]:
-    """What to say of too many steps, and where it applies."""
+    """What to say of too many steps, and where it applies. `state` is that of the hook at the end."""
     if not isinstance(solver, Projected):
         return []
-    undone = _undo_steps(statistics, num_accepted_steps, solver.projection)
-    return [(undone & (result == RESULTS.max_steps_reached), _NOT_TANGENT)]
+    undone = _undo_steps(state.statistics, sol.stats["num_accepted_steps"], solver.projection)
+    return [(undone & (sol.result == RESULTS.max_steps_reached), _NOT_TANGENT)]
 
 
 def _undo_steps(

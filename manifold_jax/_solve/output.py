@@ -13,6 +13,8 @@ from jaxtyping import Array
 from .._base.compat import save_y
 from .._base.types import Args, BoolScalar, Y
 from .._solver.base import AbstractManifoldSolver
+from .prepare import Ready
+from .setup import Given, Setup
 
 
 # Outputs up to which they are corrected one by one, in a program that compiles in two thirds of the
@@ -30,18 +32,27 @@ def _is_interpolated(sub: dfx.SubSaveAt, event: dfx.Event | None) -> bool:
     return sub.ts is not None or event is not None
 
 
-def on_manifold_saving(
-    saveat: dfx.SaveAt, solver: AbstractManifoldSolver, event: dfx.Event | None
-) -> dfx.SaveAt:
+def saves_state(saveat: dfx.SaveAt) -> bool:
+    """Whether some states are saved as they are."""
+    return any(sub.fn is save_y for sub in jtu.tree_leaves(saveat.subs, is_leaf=_is_sub))
+
+
+def saving(setup: Setup) -> dfx.SaveAt:
     """What Diffrax is asked to save.
 
     The state itself is corrected after the solve, which is cheaper than in Diffrax's loop over
     outputs; only a user's function has to see corrected states on the way.
-    The solver's state is always kept, for the statistics in it.
+    The state of a hook is always kept, for the statistics in it. Without a hook the last state is
+    saved in any case, to see whether it is finite.
     """
+    saveat, solver = setup.saveat, setup.solver
+    replaced = lambda where, value: eqx.tree_at(where, saveat, value, is_leaf=lambda x: x is None)
+    if not isinstance(solver, AbstractManifoldSolver):
+        both = saveat.subs, dfx.SubSaveAt(t1=True)
+        return saveat if saves_state(saveat) else replaced(lambda s: s.subs, both)
 
     def wrap(sub: dfx.SubSaveAt) -> dfx.SubSaveAt:
-        if sub.fn is save_y or not _is_interpolated(sub, event):
+        if sub.fn is save_y or not _is_interpolated(sub, setup.event):
             return sub
 
         def fn(t, y, args):
@@ -53,62 +64,44 @@ def on_manifold_saving(
     subs = saveat.subs
     if solver.corrects_output:
         subs = jtu.tree_map(wrap, subs, is_leaf=_is_sub)
-    return eqx.tree_at(
-        lambda s: (s.subs, s.solver_state), saveat, (subs, True), is_leaf=lambda x: x is None
-    )
+    return replaced(lambda s: (s.subs, s.solver_state), (subs, True))
 
 
-def events_in_true_time(
-    event: dfx.Event | None,
-    terms: Any,
-    t0: Any,
-    t1: Any,
-    dt0: Any,
-) -> dfx.Event | None:
+def events_in_true_time(setup: Setup, ready: Ready) -> dfx.Event | None:
     """Events that see the true time.
 
     Diffrax hands an event function negated times when integrating backwards; with the
     original terms and times it is consistent again. States at the ends of steps are on the
     manifold.
     """
+    event, given = setup.event, ready.given
     if event is None:
         return None
-    direction = jnp.where(t0 < t1, 1, -1)
+    known = dict(terms=setup.terms, t0=given.t0, t1=given.t1, dt0=ready.dt0)
+    direction = given.direction
 
     def wrap(cond_fn: Callable) -> Callable:
-        def in_true_time(t, y, args, **kwargs):
-            kwargs = {**kwargs, "terms": terms, "t0": t0, "t1": t1, "dt0": dt0}
-            return cond_fn(t * direction, y, args, **kwargs)
-
-        return in_true_time
+        return lambda t, y, args, **kwargs: cond_fn(t * direction, y, args, **{**kwargs, **known})
 
     cond_fn = jtu.tree_map(wrap, event.cond_fn, is_leaf=callable)
     return dfx.Event(cond_fn, event.root_finder, event.direction)
 
 
-def project_output(
-    saveat: dfx.SaveAt,
-    event: dfx.Event | None,
-    solver: AbstractManifoldSolver,
-    ts: Any,
-    ys: Any,
-    y0: Y,
-    args: Args,
-) -> tuple[Any, BoolScalar]:
+def project_output(setup: Setup, given: Given, ts: Any, ys: Any) -> tuple[Any, BoolScalar]:
     """The saved values, corrected; and whether any of them could not be."""
-    failed = jnp.asarray(False)
+    solver, failed = setup.solver, jnp.asarray(False)
     if not solver.corrects_output:
         return ys, failed
 
     def correct(sub: dfx.SubSaveAt, ts: Array, ys: Any) -> Any:
         nonlocal failed
-        if not _is_interpolated(sub, event):
+        if not _is_interpolated(sub, setup.event):
             return ys
         if sub.fn is not save_y:
             values, successes = ys
             failed |= jnp.any(jnp.isfinite(ts) & ~successes)
             return values
-        one = lambda t, y: _corrected(solver, t, y, y0, args)
+        one = lambda t, y: _corrected(solver, t, y, given.y0, given.args)
         if ts.size <= MOST_ONE_BY_ONE:
             out, failures = jax.lax.map(lambda ty: one(*ty), (ts, ys))
         else:
@@ -116,7 +109,7 @@ def project_output(
         failed |= jnp.any(failures)
         return out
 
-    ys = jtu.tree_map(correct, saveat.subs, ts, ys, is_leaf=_is_sub)
+    ys = jtu.tree_map(correct, setup.saveat.subs, ts, ys, is_leaf=_is_sub)
     return ys, failed
 
 

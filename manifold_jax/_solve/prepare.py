@@ -6,10 +6,10 @@ import diffrax as dfx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jaxtyping import Array
 
-from .._base.types import Args, RealScalarLike, Y
+from .._base.types import RealScalarLike, Y
 from .._constraint.checks import check_constraint, check_state
+from .._constraint.constraint import NoConstraint
 from .._rosenbrock import AbstractRosenbrock, MassMatrixTerm
 from .._solver.base import AbstractManifoldSolver, controller_tolerances
 from .._solver.step.advance import HookState
@@ -18,64 +18,49 @@ from .._solver.terms import DirectedTerm
 from .._solver.unconstrained import Unconstrained
 from .first_step import first_step, FirstStep
 from .mass_matrix import consistent_with_mass
-from .start import Consistent, start_state, StartInfo
+from .setup import Given, Setup
+from .start import start_state, StartInfo
 
 
 class Ready(NamedTuple):
     """What a loop starts from; all times in one type of number. The state of the solver, where it
     is known without `solver.init`."""
 
-    t0: Array
-    t1: Array
+    given: Given
     dt0: RealScalarLike | None
-    y0: Y
     solver_state: HookState | None
     start: StartInfo
 
 
-def prepare(
-    terms: Any,
-    solver: AbstractManifoldSolver,
-    t0: RealScalarLike,
-    t1: RealScalarLike,
-    dt0: RealScalarLike | None,
-    y0: Y,
-    args: Args,
-    saveat: dfx.SaveAt,
-    controller: dfx.AbstractStepSizeController,
-    consistent: Consistent,
-    throw: bool,
-) -> Ready:
-    """`controller` chooses the first step if `dt0` is None."""
-    dtype = time_dtype(t0, t1, dt0, saveat)
-    y0 = as_state(y0, dtype)
-    t0, t1 = jnp.asarray(t0, dtype), jnp.asarray(t1, dtype)
-    y0, moved = consistent_with_mass(terms, t0, y0, args, consistent, throw)
-    if isinstance(solver, Unconstrained):
-        start = StartInfo(jnp.zeros((), dtype), jnp.asarray(True))
+def prepare(setup: Setup, given: Given) -> Ready:
+    """Make the start consistent, and choose the first step if `dt0` is None. A method of Diffrax
+    without a hook is left to Diffrax, for comparisons."""
+    if not isinstance(setup.solver, AbstractManifoldSolver | AbstractRosenbrock):
+        return Ready(given, setup.dt0, None, StartInfo(jnp.zeros(()), jnp.asarray(True)))
+    dtype = time_dtype(given.t0, given.t1, setup.dt0, setup.saveat)
+    t0, t1 = jnp.asarray(given.t0, dtype), jnp.asarray(given.t1, dtype)
+    y0, start = _start(setup, given._replace(t0=t0, y0=as_state(given.y0, dtype)))
+    given = Given(t0, t1, y0, given.args)
+    dt0, solver_state = setup.dt0, None
+    if dt0 is None and (first := _chosen_first_step(setup, given)):
+        dt0 = first.size
+        solver_state = _solver_state(setup, given, first)
+    if not setup.throw:  # what starts with NaN ends before its first step
+        y0 = jtu.tree_map(lambda leaf: jnp.where(start.success, leaf, jnp.nan), y0)
+    return Ready(given._replace(y0=y0), dt0, solver_state, start)
+
+
+def _start(setup: Setup, given: Given) -> tuple[Y, StartInfo]:
+    y0, moved = consistent_with_mass(setup, given)
+    constraint = getattr(setup.solver, "constraint", NoConstraint())
+    if isinstance(constraint, NoConstraint):
+        start = StartInfo(jnp.zeros_like(given.t0), jnp.asarray(True))
     else:
-        check_constraint(solver.constraint, t0, y0, args)
-        y0, start = start_state(
-            solver.constraint, t0, y0, args, solver.projection, consistent, throw
-        )
+        check_constraint(constraint, given.t0, y0, given.args)
+        y0, start = start_state(setup, given._replace(y0=y0))
     if moved is not None:
         start = start._replace(correction=jnp.maximum(moved, start.correction))
-    solver_state = None
-    if (
-        dt0 is None
-        and _is_first_step_chosen_here(solver)
-        and (first := chosen_first_step(terms, solver, t0, t1, y0, args, controller))
-    ):
-        dt0 = first.size
-        solver_state = _solver_state(terms, solver, t0, y0, args, first)
-    if not throw:  # what starts with NaN ends before its first step
-        y0 = jtu.tree_map(lambda leaf: jnp.where(start.success, leaf, jnp.nan), y0)
-    return Ready(t0, t1, dt0, y0, solver_state, start)
-
-
-def _is_first_step_chosen_here(solver: AbstractManifoldSolver) -> bool:
-    """A method of Diffrax without a constraint is left to the choice of Diffrax, for comparisons."""
-    return not isinstance(solver, Unconstrained) or isinstance(solver.inner, AbstractRosenbrock)
+    return y0, start
 
 
 def time_dtype(t0: Any, t1: Any, dt0: Any, saveat: dfx.SaveAt) -> Any:
@@ -93,23 +78,26 @@ def as_state(y0: Y, dtype: Any) -> Y:
         return jtu.tree_map(lambda leaf: jnp.asarray(leaf, jnp.result_type(leaf, dtype)), y0)
 
 
-def chosen_first_step(terms, solver, t0, t1, y0, args, controller) -> FirstStep | None:
-    tolerances = controller_tolerances(controller)
+def _chosen_first_step(setup: Setup, given: Given) -> FirstStep | None:
+    terms, tolerances = setup.terms, controller_tolerances(setup.controller)
+    inner = getattr(setup.solver, "inner", setup.solver)
+    if isinstance(setup.solver, Unconstrained) and not isinstance(inner, AbstractRosenbrock):
+        return None  # as Diffrax chooses it
     if isinstance(terms, MassMatrixTerm):
         terms = dfx.ODETerm(terms.derivative)
     if tolerances is None or not isinstance(terms, dfx.ODETerm | DirectedTerm):
         return None
-    return first_step(terms, solver, t0, t1, y0, args, tolerances)
+    return first_step(terms, setup.solver, given, tolerances)
 
 
-def _solver_state(
-    terms: Any, solver: AbstractManifoldSolver, t0: Array, y0: Y, args: Args, first: FirstStep
-) -> HookState | None:
+def _solver_state(setup: Setup, given: Given, first: FirstStep) -> HookState | None:
     """What `solver.init` would evaluate the vector field for once more, if it is that of `terms`."""
+    terms, solver, (t0, _, y0, args) = setup.terms, setup.solver, given
+    if not isinstance(solver, AbstractManifoldSolver) or solver.prepare_terms(terms) is not terms:
+        return None
     t1 = t0 + first.size
     execution = solver.execution(terms, t0, t1, y0, args)
-    rewritten = solver.prepare_terms(terms) is not terms
-    if rewritten or not isinstance(execution, ExplicitStep):
+    if not isinstance(execution, ExplicitStep):
         return None
     memory = first.field if execution.remembers_field else None
     return HookState.initial(memory, t0, t1, y0)

@@ -1,20 +1,16 @@
 """The initial value: moved onto the manifold, checked, or trusted."""
 
-from typing import Literal, NamedTuple, TypeAlias
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import jax.tree_util as jtu
 
 from .._base.rejection import is_finite
-from .._base.types import Args, BoolScalar, FloatScalar, RealScalarLike, Y
-from .._constraint.constraint import AbstractConstraint
+from .._base.types import BoolScalar, FloatScalar, Y
 from .._constraint.diagnosis import Diagnosis, NOT_THERE
 from .._constraint.project import consistent_state
-from .._constraint.settings import NewtonProjection
 from .._constraint.violation import constraint_violation
-
-
-Consistent: TypeAlias = Literal["project", "check", "assume"]
+from .setup import Given, Setup
 
 
 class StartInfo(NamedTuple):
@@ -24,16 +20,10 @@ class StartInfo(NamedTuple):
     success: BoolScalar
 
 
-def start_state(
-    constraint: AbstractConstraint,
-    t0: RealScalarLike,
-    y0: Y,
-    args: Args,
-    projection: NewtonProjection,
-    consistent: Consistent,
-    throw: bool,
-) -> tuple[Y, StartInfo]:
+def start_state(setup: Setup, given: Given) -> tuple[Y, StartInfo]:
     """The state to start from. With `throw` the error that names the cause is attached to it."""
+    (t0, _, y0, args), consistent = given, setup.consistent
+    constraint, projection = setup.solver.constraint, setup.solver.projection
     if consistent == "assume":
         dtype = jnp.result_type(*jtu.tree_leaves(y0))
         return y0, StartInfo(jnp.zeros((), dtype), jnp.asarray(True))
@@ -44,7 +34,7 @@ def start_state(
         satisfied = violation <= projection.tolerance_for(violation.dtype)
         success = satisfied & info.full_rank & is_finite(y0)
         start, correction = y0, jnp.zeros_like(correction)
-    if throw:
+    if setup.throw:
         diagnosis = Diagnosis.of_start(constraint, t0, y0, args, info)
         if consistent == "check":
             cause = jnp.where(info.success, NOT_THERE, diagnosis.cause)

@@ -16,7 +16,7 @@ from ..._base.errors import clear_errors, refuse_old_names
 from ..._base.numbers import numbers_as_arrays
 from ..._base.types import Args, RealScalarLike, Y
 from ..._solve.arguments import check_arguments, fault_of_field, warn_of_rounding, without_idle_hook
-from ..._solve.start import Consistent
+from ..._solve.setup import Consistent
 from ..._solve.times import checking_first_step
 from ..lanes.arguments import (
     anywhere,

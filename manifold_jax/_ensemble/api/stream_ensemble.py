@@ -15,7 +15,7 @@ from jaxtyping import Array
 
 from ..._base.errors import clear_errors, refuse_old_names
 from ..._base.types import RealScalarLike
-from ..._solve.start import Consistent
+from ..._solve.setup import Consistent
 from ..lanes.solution import messages_of
 from ..stored.arrays import (
     clear_partial,

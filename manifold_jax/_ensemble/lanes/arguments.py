@@ -14,8 +14,8 @@ from jaxtyping import Array
 from ..._base.types import Args, Y
 from ..._constraint.checks import check_state
 from ..._solve.prepare import time_dtype
+from ..._solve.setup import Given
 from ..._solve.times import is_no_step, NO_FIRST_STEP, NO_OUTPUT_TIME
-from .trajectory import Given
 
 
 # Names of the axes of a mesh over which trajectories are shared out; none on one device.

@@ -7,8 +7,9 @@ import equinox as eqx
 import jax
 import jax.tree_util as jtu
 
+from ..._solve.setup import Given
 from .arguments import Batch
-from .trajectory import Equations, Given
+from .trajectory import Equations
 
 
 Inputs = tuple[Equations, Batch]

@@ -14,9 +14,9 @@ from diffrax import RESULTS
 
 from ..._base.compat import directed, is_okay, nonlinear_failure, update_result
 from ..._base.rejection import result_of_state
-from ..._base.types import Args, BoolScalar, FloatScalar, IntScalar, RealScalarLike, Y
+from ..._base.types import BoolScalar, FloatScalar, IntScalar, RealScalarLike, Y
 from ..._solve.prepare import prepare, Ready
-from ..._solve.start import Consistent
+from ..._solve.setup import Consistent, Given, Setup
 from ..._solve.times import is_time_missing
 from ..._solver.step.advance import HookState, StepStatistics
 
@@ -32,19 +32,6 @@ class Trajectory(NamedTuple):
     result: RESULTS
     num_steps: IntScalar
     num_accepted: IntScalar
-
-
-class Given(NamedTuple):
-    """What a trajectory is defined by, besides what all have in common."""
-
-    t0: FloatScalar
-    t1: FloatScalar
-    y0: Y
-    args: Args
-
-    @property
-    def direction(self) -> FloatScalar:
-        return jnp.where(self.t0 < self.t1, 1, -1).astype(self.t0.dtype)
 
 
 class Start(NamedTuple):
@@ -88,41 +75,28 @@ class Equations(eqx.Module):
     def begin(self, given: Given) -> Start:
         solver, args, ready = self.solver, given.args, self._ready(given)
         terms, direction = self._directed(given)
-        t0, t1 = ready.t0 * direction, ready.t1 * direction
+        y0 = ready.given.y0
+        t0, t1 = ready.given.t0 * direction, ready.given.t1 * direction
         dt0 = None if ready.dt0 is None else ready.dt0 * direction
         error_order = solver.error_order(terms)
         tnext, controller_state = self.controller.wrap(direction).init(
-            terms, t0, t1, ready.y0, dt0, args, solver.func, error_order
+            terms, t0, t1, y0, dt0, args, solver.func, error_order
         )
         tnext = jnp.minimum(tnext, t1)
         solver_state = ready.solver_state
         if solver_state is None:
-            solver_state = solver.init(terms, t0, tnext, ready.y0, args)
+            solver_state = solver.init(terms, t0, tnext, y0, args)
         result = RESULTS.where(ready.start.success, RESULTS.successful, nonlinear_failure())
-        result = update_result(result, result_of_state(ready.y0))
+        result = update_result(result, result_of_state(y0))
         missing = is_time_missing(given.t0, given.t1)
         result = RESULTS.where(missing, RESULTS.nonfinite_input, result)  # pyright: ignore[reportArgumentType]
         zero = jnp.zeros((), jnp.int32)
-        trajectory = Trajectory(
-            t0, tnext, ready.y0, solver_state, controller_state, result, zero, zero
-        )
+        trajectory = Trajectory(t0, tnext, y0, solver_state, controller_state, result, zero, zero)
         return Start(trajectory, ready.start.correction)
 
     def _ready(self, given: Given) -> Ready:
-        solver, (t0, t1, y0, args) = self.solver, given
-        return prepare(
-            self.terms,
-            solver,
-            t0,
-            t1,
-            self.dt0,
-            y0,
-            args,
-            self.saveat,
-            self.controller,
-            self.consistent,
-            throw=False,
-        )
+        setup = self.terms, self.solver, self.dt0, self.saveat, self.controller, self.consistent
+        return prepare(Setup(*setup, throw=False), given)
 
     def goes_on(self, given: Given, trajectory: Trajectory) -> BoolScalar:
         before = trajectory.tprev < given.t1 * given.direction
