@@ -35,11 +35,6 @@ def _initial_state(args: OscillatorArgs, start: Float[Array, "2"] | None) -> Flo
     return jnp.stack([args.radius, jnp.zeros_like(args.radius)])
 
 
-def _make_constraint(args: OscillatorArgs, y0: Float[Array, "2"]) -> Constraint:
-    del args, y0
-    return Constraint(_residual)
-
-
 def _exact(t: np.ndarray, args: OscillatorArgs, y0: np.ndarray) -> np.ndarray:
     del args
     c, s = np.cos(t), np.sin(t)
@@ -72,9 +67,9 @@ def harmonic_oscillator(*, radius: Any = 1.0, t1: float = 2 * math.pi) -> Proble
     return Problem(
         "harmonic-oscillator",
         diffrax.ODETerm(_field),
+        constraint=Constraint(_residual),
         t1=t1,
         args=OscillatorArgs(radius),
         initial_state=_initial_state,
-        make_constraint=_make_constraint,
         exact=_exact,
     )

@@ -126,6 +126,7 @@ def parallelogram(
     Source: the mechanism is classical; redundant constraints as in Garcia de Jalon & Bayo,
     Kinematic and Dynamic Simulation of Multibody Systems (1994).
     """
+    args = ParallelogramArgs(coupler_mass, coupler_inertia, crank_mass, length, spacing, gravity)
     angle, rate = as_floating(angle), as_floating(rate)
     zero = jnp.zeros_like(angle)
     start = jnp.stack([zero] * 3 + [angle] * 3), jnp.stack([zero] * 3 + [rate] * 3)
@@ -133,14 +134,7 @@ def parallelogram(
         "parallelogram",
         system=MechanicalSystem(_mass, _joints, _force, redundant=True),
         t1=t1,
-        args=ParallelogramArgs(
-            coupler_mass,
-            coupler_inertia,
-            crank_mass,
-            length,
-            spacing,
-            gravity,
-        ),
+        args=args,
         start=start,
         initial_state=_initial_state,
         exact=_exact,

@@ -14,7 +14,8 @@ from .._mechanics import MechanicalSystem
 from ._problem import as_floating, Problem
 
 
-State: TypeAlias = tuple[Float[Array, "2"], Float[Array, "2"]]
+Vector: TypeAlias = Float[Array, " n"]  # two numbers, three of the spherical pendulum
+State: TypeAlias = tuple[Vector, Vector]
 
 # Coordinates of benchmark A01 at t = 0, 0.5, ..., 10: released at rest from (-1, 0) with
 # g = 9.81, m = L = 1. All 6 printed digits are right. Source: IFToMM Technical Committee
@@ -32,26 +33,24 @@ A01_Y = (
 
 
 class PendulumArgs(NamedTuple):
-    """Parameters of `pendulum`: gravity (m/s^2), length (m), mass (kg)."""
+    """Parameters of `pendulum` and `spherical_pendulum`: gravity (m/s^2), length (m), mass (kg)."""
 
     gravity: Any = 9.81
     length: Any = 1.0
     mass: Any = 1.0
 
 
-def _mass(q: Float[Array, "2"], args: PendulumArgs) -> FloatScalar:
+def point_mass(q: Vector, args: PendulumArgs) -> FloatScalar:
     del q
     return args.mass
 
 
-def _rod(t: RealScalarLike, q: Float[Array, "2"], args: PendulumArgs) -> FloatScalar:
+def rod(t: RealScalarLike, q: Vector, args: PendulumArgs) -> FloatScalar:
     del t
     return jnp.sum(q * q) - args.length**2
 
 
-def _force(
-    t: RealScalarLike, q: Float[Array, "2"], v: Float[Array, "2"], args: PendulumArgs
-) -> Float[Array, "2"]:
+def _force(t: RealScalarLike, q: Vector, v: Vector, args: PendulumArgs) -> Vector:
     del t, q, v
     return jnp.stack([jnp.zeros_like(args.mass), -args.mass * args.gravity])
 
@@ -66,7 +65,8 @@ def _field(t: RealScalarLike, y: State, args: PendulumArgs) -> State:
     return v, free - mu * q
 
 
-def _initial_state(args: PendulumArgs, start: State) -> State:
+def moved_along_ray(args: PendulumArgs, start: State) -> State:
+    """The position of `start` at the length of `args`, and its velocity."""
     q, v = start
     return q * (args.length / jnp.sqrt(jnp.sum(q * q))), v
 
@@ -158,11 +158,11 @@ def pendulum(
     return Problem(
         "pendulum",
         diffrax.ODETerm(_field),
-        system=MechanicalSystem(_mass, _rod, _force),
+        system=MechanicalSystem(point_mass, rod, _force),
         t1=t1,
         args=PendulumArgs(gravity, length, mass),
         start=(q0, v0),
-        initial_state=_initial_state,
+        initial_state=moved_along_ray,
         exact=_exact,
     )
 

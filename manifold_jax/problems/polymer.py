@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 
 from .._base.types import RealScalarLike
 from .._mechanics import MechanicalSystem
-from ._problem import as_floating, Problem
+from ._problem import as_floating, Problem, repeated
 from ._rods import allowed, Rods, solve_rods
 
 
@@ -122,10 +122,8 @@ def polymer(
     Ryckaert, Ciccotti & Berendsen, J. Comput. Phys. 23 (1977) 327-341 (SHAKE); Andersen, J. Comput.
     Phys. 52 (1983) 24-34 (RATTLE).
     """
-    per = lambda value, number, what: _per(as_floating(value), number, what)
-    args = PolymerArgs(
-        per(masses, bonds + 1, "masses"), per(lengths, bonds, "lengths"), as_floating(stiffness)
-    )
+    masses, lengths = repeated(masses, bonds + 1, "masses"), repeated(lengths, bonds, "lengths")
+    args = PolymerArgs(masses, lengths, as_floating(stiffness))
     start = _thermal(args, temperature, np.random.default_rng(seed))
     return Problem(
         "polymer",
@@ -138,12 +136,6 @@ def polymer(
     )
 
 
-def _per(value: Array, number: int, what: str) -> Array:
-    if value.shape not in ((), (number,)):
-        raise ValueError(f"`{what}` must be a scalar or of shape ({number},), got {value.shape}.")
-    return jnp.broadcast_to(value, (number,))
-
-
 def _thermal(
     args: PolymerArgs, temperature: float, random: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -154,7 +146,7 @@ def _thermal(
     uniform = random.uniform(size=bonds)
     cosine = 1 + np.log(uniform + (1 - uniform) * np.exp(-2 * stretch)) / stretch
     along = np.empty((bonds, 3))
-    along[0] = np.array([1.0, 0.0, 0.0])
+    along[0] = 1.0, 0.0, 0.0
     for i in range(1, bonds):
         across = random.normal(size=3)
         across -= across @ along[i - 1] * along[i - 1]

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 
 from .._base.types import FloatScalar, RealScalarLike
 from .._constraint.constraint import Constraint
-from ._problem import Problem
+from ._problem import as_floating, Problem
 
 
 State: TypeAlias = tuple[Float[Array, "2"], Float[Array, "2"]]
@@ -33,16 +33,6 @@ def _jay2_field(t: RealScalarLike, y: Float[Array, "2"], args: None) -> Float[Ar
 def _jay2_residual(t: RealScalarLike, y: Float[Array, "2"], args: None) -> FloatScalar:
     del t, args
     return y[0] ** 2 * y[1] - 1
-
-
-def _jay2_initial_state(args: None, start: Float[Array, "2"] | None) -> Float[Array, "2"]:
-    del args
-    return jnp.ones(2) if start is None else start
-
-
-def _jay2_constraint(args: None, y0: Float[Array, "2"]) -> Constraint:
-    del args, y0
-    return Constraint(_jay2_residual)
 
 
 def _jay2_exact(t: np.ndarray, args: None, y0: np.ndarray) -> np.ndarray:
@@ -72,9 +62,9 @@ def jay2() -> Problem:
     return Problem(
         "jay2",
         diffrax.ODETerm(_jay2_field),
+        constraint=Constraint(_jay2_residual),
         t1=1.0,
-        initial_state=_jay2_initial_state,
-        make_constraint=_jay2_constraint,
+        start=jnp.ones(2),
         exact=_jay2_exact,
     )
 
@@ -96,20 +86,6 @@ def _arevalo_residual(t: RealScalarLike, y: State, args: None) -> tuple[FloatSca
     del t, args
     q, v = y
     return jnp.sum(q * q) - 1, jnp.sum(q * v)
-
-
-def _arevalo_initial_state(args: None, start: State | None) -> State:
-    del args
-    if start is not None:
-        return start
-    s, c = math.sin(AREVALO_T0**2), math.cos(AREVALO_T0**2)
-    q, v = (s, c), (2 * AREVALO_T0 * c, -2 * AREVALO_T0 * s)
-    return jnp.asarray(q, float), jnp.asarray(v, float)
-
-
-def _arevalo_constraint(args: None, y0: State) -> Constraint:
-    del args, y0
-    return Constraint(_arevalo_residual)
 
 
 def _arevalo_exact(t: np.ndarray, args: None, y0: Any) -> tuple[np.ndarray, np.ndarray]:
@@ -135,13 +111,15 @@ def arevalo() -> Problem:
     Source: C. Arevalo & P. Lotstedt, Improving the accuracy of BDF methods for index 3
     differential-algebraic equations, BIT 35 (1995) 297-308.
     """
+    s, c = math.sin(AREVALO_T0**2), math.cos(AREVALO_T0**2)
+    q, v = (s, c), (2 * AREVALO_T0 * c, -2 * AREVALO_T0 * s)
     return Problem(
         "arevalo",
         diffrax.ODETerm(_arevalo_field),
+        constraint=Constraint(_arevalo_residual),
         t0=AREVALO_T0,
         t1=5.0,
-        initial_state=_arevalo_initial_state,
-        make_constraint=_arevalo_constraint,
+        start=(as_floating(q), as_floating(v)),
         exact=_arevalo_exact,
     )
 
@@ -174,11 +152,6 @@ def _skate_initial_state(args: SkateArgs, start: State | None) -> State:
     if start is not None:
         return start
     return jnp.zeros(2, jnp.result_type(args.slope)), jnp.zeros(2, jnp.result_type(args.slope))
-
-
-def _skate_constraint(args: SkateArgs, y0: State) -> Constraint:
-    del args, y0
-    return Constraint(_skate_residual)
 
 
 def _skate_exact(t: np.ndarray, args: SkateArgs, y0: Any) -> tuple[np.ndarray, np.ndarray]:
@@ -216,9 +189,9 @@ def skate(*, slope: Any = 0.8) -> Problem:
     return Problem(
         "skate",
         diffrax.ODETerm(_skate_field),
+        constraint=Constraint(_skate_residual),
         t1=10.0,
         args=SkateArgs(slope),
         initial_state=_skate_initial_state,
-        make_constraint=_skate_constraint,
         exact=_skate_exact,
     )

@@ -1,52 +1,27 @@
 """The spherical pendulum."""
 
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, TypeAlias
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._base.types import FloatScalar, RealScalarLike
+from .._base.types import RealScalarLike
 from .._mechanics import MechanicalSystem
-from ._problem import integrate, Problem
+from ._problem import as_floating, integrate, Problem
+from .pendulum import moved_along_ray, PendulumArgs, point_mass, rod
 
 
 Vector: TypeAlias = Float[Array, "3"]
-State: TypeAlias = tuple[Vector, Vector]
 
 
-class SphericalPendulumArgs(NamedTuple):
-    """Parameters of `spherical_pendulum`: gravity (m/s^2), length (m), mass (kg)."""
-
-    gravity: Any = 9.81
-    length: Any = 1.0
-    mass: Any = 1.0
-
-
-def _mass(q: Vector, args: SphericalPendulumArgs) -> FloatScalar:
-    del q
-    return args.mass
-
-
-def _rod(t: RealScalarLike, q: Vector, args: SphericalPendulumArgs) -> FloatScalar:
-    del t
-    return jnp.sum(q * q) - args.length**2
-
-
-def _force(t: RealScalarLike, q: Vector, v: Vector, args: SphericalPendulumArgs) -> Vector:
+def _force(t: RealScalarLike, q: Vector, v: Vector, args: PendulumArgs) -> Vector:
     del t, q, v
     zero = jnp.zeros_like(args.mass)
     return jnp.stack([zero, zero, -args.mass * args.gravity])
 
 
-def _initial_state(args: SphericalPendulumArgs, start: State | None) -> State:
-    if start is None:
-        start = (jnp.asarray([0.8, 0.0, -0.6]), jnp.asarray([0.0, 2.0, 0.0]))
-    q, v = start
-    return q * (args.length / jnp.sqrt(jnp.sum(q * q))), v
-
-
-def _exact(t: np.ndarray, args: SphericalPendulumArgs, y0: Any) -> tuple[np.ndarray, np.ndarray]:
+def _exact(t: np.ndarray, args: PendulumArgs, y0: Any) -> tuple[np.ndarray, np.ndarray]:
     """Angles on the sphere are singular at its poles; Newton's equations are not:
 
     q'' = (0, 0, -g) - (|v|^2 - g z) q / |q|^2.
@@ -91,9 +66,10 @@ def spherical_pendulum(
     """
     return Problem(
         "spherical-pendulum",
-        system=MechanicalSystem(_mass, _rod, _force),
+        system=MechanicalSystem(point_mass, rod, _force),
         t1=t1,
-        args=SphericalPendulumArgs(gravity, length, mass),
-        initial_state=_initial_state,
+        args=PendulumArgs(gravity, length, mass),
+        start=(as_floating([0.8, 0.0, -0.6]), as_floating([0.0, 2.0, 0.0])),
+        initial_state=moved_along_ray,
         exact=_exact,
     )
