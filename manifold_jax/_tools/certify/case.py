@@ -106,20 +106,16 @@ class Case:
         saveat: dfx.SaveAt,
     ) -> dfx.Solution:
         problem = self.problem_at(theta)
-        function, terms, solver = self.approach.formulate(problem, stepping.solver, self.gain)
-        return function(
-            terms,
-            solver,
+        formulation = self.approach.formulate(problem, stepping.solver, self.gain)
+        return formulation.solve(
             problem.t0,
             self.t1,
-            None,
             problem.y0,
             problem.args,
             saveat=saveat,
             stepsize_controller=stepping.controller,
             adjoint=adjoint,
             max_steps=stepping.max_steps,
-            throw=False,
         )
 
     def end(

@@ -117,7 +117,8 @@ def certify(case: Case, adjoints: dict[str, dfx.AbstractAdjoint], hessian: bool)
     )
     (_, states, residuals), _ = outcomes = [outcome(theta) for theta in parameters]
     gradients = [np.asarray(gradient) for gradient, *_ in outcomes]
-    direction, curvature = _direction(case.theta), None
+    direction = jnp.cos(2 + jnp.arange(case.theta.size, dtype=case.theta.dtype)) * case.theta
+    curvature = None
     if hessian:
         by_forward = _gradient(case, "forward", ADJOINTS["forward"])
         curvature = np.asarray(_along(by_forward, direction)(case.theta))
@@ -195,7 +196,3 @@ def _along(gradient: Callable[[Any], Any], direction: Any) -> Callable[[Any], An
 
 def _relative(a: np.ndarray, b: np.ndarray) -> float:
     return float(np.max(np.abs(a - b)) / np.max(np.abs(b)))
-
-
-def _direction(theta: Any) -> Any:
-    return jnp.cos(2 + jnp.arange(theta.size, dtype=theta.dtype)) * theta

@@ -4,7 +4,7 @@ import inspect
 import json
 import math
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,7 @@ import jax.tree_util as jtu
 import numpy as np
 import scipy
 from rich.markup import escape
-from rich.table import Table
+from rich.table import Column, Table
 
 from ... import __version__
 from ...problems import Problem
@@ -24,7 +24,18 @@ from .methods import Measurement, Method
 from .task import OUTPUT_POINTS, Task
 
 
-# The methods for which the gain is.
+def number_columns(headings: Iterable[str]) -> list[Column]:
+    return [Column(heading, justify="right") for heading in headings]
+
+
+def format_number(value: int | float | str | None, form: str) -> str:
+    """A number in a table, in which a word may stand instead, and `-` for what is not known.
+    Where `form` asks for three digits, larger numbers have all before the point."""
+    if isinstance(value, str):
+        return value
+    if value is None:
+        return "-"
+    return format(value, ".0f" if form == ".3g" and value >= 100 else form)
 
 
 def sizes(problem: Problem) -> tuple[int, int]:
@@ -37,13 +48,8 @@ def sizes(problem: Problem) -> tuple[int, int]:
 
 
 def gallery_table(gallery: dict[str, Callable[[], Problem]]) -> Table:
-    table = Table()
-    table.add_column("name")
-    table.add_column("n", justify="right")
-    table.add_column("m", justify="right")
-    table.add_column("time span")
-    table.add_column("solution")
-    table.add_column("description", min_width=20)  # the only one to be wrapped
+    wrapped = Column("description", min_width=20)  # no other one is
+    table = Table("name", *number_columns(["n", "m"]), "time span", "solution", wrapped)
     for name, build in gallery.items():
         problem = build()
         table.add_row(
@@ -68,39 +74,28 @@ def comparison_title(task: Task) -> str:
     return f"{task.problem.name}, {task.solver}, {span}, rtol = {task.rtol:g}, atol = {task.atol:g}"
 
 
+# Headings short, so that they fit in a terminal of 80 columns; then the number of a row, and its form.
+_COLUMNS = {
+    "steps\naccepted": ("accepted", "d"),
+    "\nrejected": ("rejected", "d"),
+    "field\ncalls": ("evaluations", "d"),
+    "|g| at\nsteps": ("violation_steps", ".1e"),
+    "|g| at\noutput": ("violation_output", ".1e"),
+    "error of\nstate": ("error", ".1e"),
+    "run\n(ms)": ("run_ms", ".3g"),
+    "compile\n(s)": ("compile_s", ".2f"),
+}
+
+
 def comparison_table(measurements: Sequence[Measurement]) -> Table:
-    table = Table()
-    table.add_column("method")
-    # short, so that they fit in a terminal of 80 columns
-    for heading in (
-        "steps\naccepted",
-        "\nrejected",
-        "field\ncalls",
-        "|g| at\nsteps",
-        "|g| at\noutput",
-        "error of\nstate",
-        "run\n(ms)",
-        "compile\n(s)",
-    ):
-        table.add_column(heading, justify="right")
+    table = Table("method", *number_columns(_COLUMNS))
     for measurement in measurements:
-        row = measurement.row
-        table.add_row(
-            measurement.key,
-            _number(row.accepted, "d"),
-            _number(row.rejected, "d"),
-            _number(row.evaluations, "d"),
-            _number(row.violation_steps, ".1e"),
-            _number(row.violation_output, ".1e"),
-            _number(row.error, ".1e") if measurement.failure is None else "failed",
-            _number(row.run_ms, ".3g" if (row.run_ms or 0) < 100 else ".0f"),
-            _number(row.compile_s, ".2f"),
-        )
+        numbers = vars(measurement.row)
+        if measurement.failure is not None:
+            numbers = numbers | {"error": "failed"}
+        cells = [format_number(numbers[name], form) for name, form in _COLUMNS.values()]
+        table.add_row(measurement.key, *cells)
     return table
-
-
-def _number(value: int | float | None, fmt: str) -> str:
-    return "-" if value is None else format(value, fmt)
 
 
 def comparison_notes(

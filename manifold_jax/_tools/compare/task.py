@@ -91,24 +91,21 @@ class Task:
 
 @dataclasses.dataclass(frozen=True)
 class Run:
-    """The result of a method: its solution and what it cost. `None` is "not known".
+    """The result of a method: its solution and what it cost.
 
     - `output`: states on the output grid, `(OUTPUT_POINTS, n)`.
     - `step_times`, `steps`: the ends of the accepted steps and the states there.
-    - `run_ms`: median run time, output on the grid and steps included; `compile_s`: tracing and
-        compiling the same program.
-    - `max_steps`: the limit under which it ran.
+    - `costs`: of its row in the table those of `accepted`, `rejected`, `evaluations`, `run_ms`
+        (median run time, output on the grid and steps included) and `compile_s` (tracing and
+        compiling the same program) that are known.
+    - `max_steps`: the limit under which it ran, if there is one.
     """
 
     output: np.ndarray
     step_times: np.ndarray
     steps: np.ndarray
-    accepted: int
-    rejected: int | None
-    evaluations: int | None
-    run_ms: float
-    compile_s: float | None
-    max_steps: int | None
+    costs: dict[str, Any]
+    max_steps: int | None = None
 
 
 def as_rows(ys: Any) -> np.ndarray:

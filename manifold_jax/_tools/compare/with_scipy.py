@@ -46,10 +46,9 @@ def run_scipy(task: Task, method: str) -> Run:
         output=on_grid.y.T,
         step_times=on_steps.t[1:],
         steps=on_steps.y.T[1:],
-        accepted=len(on_steps.t) - 1,
-        rejected=None,
-        evaluations=int(on_grid.nfev),
-        run_ms=median_ms(lambda: solve(task.grid)),
-        compile_s=None,
-        max_steps=None,
+        costs={
+            "accepted": len(on_steps.t) - 1,
+            "evaluations": int(on_grid.nfev),
+            "run_ms": median_ms(lambda: solve(task.grid)),
+        },
     )
