@@ -33,23 +33,10 @@ from .stewart_platform import stewart_platform as stewart_platform
 
 
 ALL: dict[str, Callable[[], Problem]] = {
-    "harmonic-oscillator": harmonic_oscillator,
-    "pendulum": pendulum,
-    "rigid-body": rigid_body,
-    "kepler": kepler,
-    "lotka-volterra": lotka_volterra,
-    "car-axis": car_axis,
-    "jay2": jay2,
-    "arevalo": arevalo,
-    "skate": skate,
-    "sphere-flow": sphere_flow,
-    "rotation": rotation,
-    "double-pendulum": double_pendulum,
-    "chain": chain,
-    "slider-crank": slider_crank,
-    "four-bar": four_bar,
-    "parallelogram": parallelogram,
-    "spherical-pendulum": spherical_pendulum,
-    "heavy-top": heavy_top,
-    "rolling-disc": rolling_disc,
-}
+    build.__name__.replace("_", "-"): build
+    for build in (
+        harmonic_oscillator, pendulum, rigid_body, kepler, lotka_volterra, car_axis, jay2, arevalo,
+        skate, sphere_flow, rotation, double_pendulum, chain, slider_crank, four_bar, parallelogram,
+        spherical_pendulum, heavy_top, rolling_disc,
+    )
+}  # fmt: skip

@@ -1,11 +1,15 @@
-"""Point masses on rigid rods: their reference solution, and velocities that the rods allow."""
+"""Point masses on rigid rods: their equations, reference solutions, and velocities that rods allow."""
 
+import functools
+import operator
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 import scipy.linalg
 import scipy.sparse as sp
+from jaxtyping import Array
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from ._problem import integrate
@@ -51,6 +55,17 @@ class Rods(NamedTuple):
         np.add.at(rates, self.end, pull)
         np.subtract.at(rates, self.start, pull)
         return self.inverse_masses[:, None] * rates
+
+
+def equal_masses(q: Any, args: Any) -> Array:
+    return jnp.broadcast_to(args.mass, q.shape)
+
+
+def stretch(d: Any, length2: Any) -> Array:
+    """The residual of rods `d`, `(..., dimensions)`, with the squares of lengths `length2`. Not as a
+    sum over an axis, which XLA would give to a library."""
+    parts = [d[..., i] for i in range(d.shape[-1])]
+    return 0.5 * (functools.reduce(operator.add, [x * x for x in parts]) - length2)
 
 
 def allowed(rods: Rods, q: np.ndarray, v: np.ndarray) -> np.ndarray:

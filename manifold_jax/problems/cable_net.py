@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 from .._base.types import RealScalarLike
 from .._mechanics import MechanicalSystem
 from ._problem import as_floating, Problem
-from ._rods import Rods, solve_rods
+from ._rods import equal_masses, Rods, solve_rods, stretch
 
 
 Knots: TypeAlias = Float[Array, "rows columns 3"]
@@ -29,19 +29,10 @@ class CableNetArgs(NamedTuple):
     gravity: Any
 
 
-def _mass(q: Knots, args: CableNetArgs) -> Knots:
-    return jnp.broadcast_to(args.mass, q.shape)
-
-
 def _cables(t: RealScalarLike, q: Knots, args: CableNetArgs) -> Any:
     del t
     corners = q[_CORNERS] - _folded(jnp, q.shape, args)[_CORNERS]
-    return tuple(_stretch(jnp.diff(q, axis=axis), args) for axis in (0, 1)), corners
-
-
-def _stretch(d: Float[Array, "i j 3"], args: CableNetArgs) -> Float[Array, "i j"]:
-    x, y, z = d[..., 0], d[..., 1], d[..., 2]
-    return 0.5 * (x * x + y * y + z * z - args.length**2)
+    return tuple(stretch(jnp.diff(q, axis=axis), args.length**2) for axis in (0, 1)), corners
 
 
 def _force(t: RealScalarLike, q: Knots, v: Knots, args: CableNetArgs) -> Knots:
@@ -120,7 +111,7 @@ def cable_net(
     args = CableNetArgs(*map(as_floating, (mass, length, spacing, gravity)))
     return Problem(
         "cable-net",
-        system=MechanicalSystem(_mass, _cables, _force),
+        system=MechanicalSystem(equal_masses, _cables, _force),
         t1=t1,
         args=args,
         start=(jnp.zeros((rows, columns, 3)), jnp.zeros((rows, columns, 3))),

@@ -21,9 +21,6 @@ Vector: TypeAlias = Float[Array, " n"]
 Matrix: TypeAlias = Float[Array, "3 3"]
 
 
-# sphere_flow
-
-
 class SphereFlowArgs(NamedTuple):
     """Parameters of `sphere_flow`: the symmetric matrix, shape `(n, n)`."""
 
@@ -92,9 +89,6 @@ def sphere_flow(*, n: int = 10, t1: float = 2.0) -> Problem:
         initial_state=_sphere_initial_state,
         exact=_sphere_exact,
     )
-
-
-# rotation
 
 
 class RotationArgs(NamedTuple):

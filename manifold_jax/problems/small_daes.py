@@ -16,13 +16,13 @@ from .._constraint.constraint import Constraint
 from ._problem import as_floating, Problem
 
 
-State: TypeAlias = tuple[Float[Array, "2"], Float[Array, "2"]]
+Vector: TypeAlias = Float[Array, "2"]
+State: TypeAlias = tuple[Vector, Vector]
+
+AREVALO_T0 = 1.0
 
 
-# jay2
-
-
-def _jay2_field(t: RealScalarLike, y: Float[Array, "2"], args: None) -> Float[Array, "2"]:
+def _jay2_field(t: RealScalarLike, y: Vector, args: None) -> Vector:
     del t, args
     y1, y2 = y[0], y[1]
     # the root of 2 y2 z^2 - 3 z + y1^2 = 0 that is 1 / y2 on the manifold
@@ -30,7 +30,7 @@ def _jay2_field(t: RealScalarLike, y: Float[Array, "2"], args: None) -> Float[Ar
     return jnp.stack([y1 * y2**2 * z**2, y1**2 * y2**2 - 3 * y2**2 * z])
 
 
-def _jay2_residual(t: RealScalarLike, y: Float[Array, "2"], args: None) -> FloatScalar:
+def _jay2_residual(t: RealScalarLike, y: Vector, args: None) -> FloatScalar:
     del t, args
     return y[0] ** 2 * y[1] - 1
 
@@ -67,11 +67,6 @@ def jay2() -> Problem:
         start=jnp.ones(2),
         exact=_jay2_exact,
     )
-
-
-# arevalo
-
-AREVALO_T0 = 1.0
 
 
 def _arevalo_field(t: RealScalarLike, y: State, args: None) -> State:
@@ -122,9 +117,6 @@ def arevalo() -> Problem:
         start=(as_floating(q), as_floating(v)),
         exact=_arevalo_exact,
     )
-
-
-# skate
 
 
 class SkateArgs(NamedTuple):

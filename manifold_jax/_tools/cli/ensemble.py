@@ -101,8 +101,6 @@ def ensemble(
 
 
 def _summary(stored: "StoredEnsemble", drawn: list[str], new: int, seconds: float) -> list[str]:
-    import numpy as np
-
     reasons = stored.failures_by_reason()
     steps, most, violation = 0, 0, 0.0
     for start in range(0, stored.size, stored.chunk):
@@ -110,7 +108,7 @@ def _summary(stored: "StoredEnsemble", drawn: list[str], new: int, seconds: floa
         count = stored.stats["num_steps"][part]
         steps, most = steps + int(count.sum()), max(most, int(count.max()))
         good = stored.ys["violation"][part][stored.result[part] == 0]
-        violation = max(violation, float(np.max(good, initial=0.0)))
+        violation = max(violation, float(good.max(initial=0.0)))
     lines = [f"varied:       {', '.join(drawn)}", f"failed:       {stored.num_failed}"]
     for reason, (count, first) in reasons.items():
         numbers = ", ".join(map(str, first)) + (", ..." if count > len(first) else "")

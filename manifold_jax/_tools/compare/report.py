@@ -140,12 +140,7 @@ def write_json(
     """Everything in the table and how it was made. Unknown numbers are null."""
     n, m = sizes(task.problem)
     settings = {
-        "solver": task.solver,
-        "rtol": task.rtol,
-        "atol": task.atol,
-        "gain": task.gain,
-        "t0": task.t0,
-        "t1": task.t1,
+        **{name: getattr(task, name) for name in ("solver", "rtol", "atol", "gain", "t0", "t1")},
         "output_points": OUTPUT_POINTS,
         "max_steps": max_steps(measurements),
         "states": n,
@@ -153,10 +148,7 @@ def write_json(
         "device": jax.devices()[0].device_kind,
         "versions": {
             "manifold_jax": __version__,
-            "diffrax": diffrax.__version__,
-            "jax": jax.__version__,
-            "numpy": np.__version__,
-            "scipy": scipy.__version__,
+            **{module.__name__: module.__version__ for module in (diffrax, jax, np, scipy)},
         },
         "failures": {m.row.method: m.failure for m in measurements if m.failure is not None},
         "left_out": {method.name(task): str(method.needs) for method in left_out},

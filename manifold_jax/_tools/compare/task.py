@@ -63,18 +63,12 @@ class Task:
     def grid(self) -> np.ndarray:
         return np.linspace(self.t0, self.t1, OUTPUT_POINTS)
 
-    def initial_row(self) -> np.ndarray:
-        return np.asarray(jfu.ravel_pytree(self.problem.y0)[0])
-
-    def unravel(self, x: Any) -> Any:
-        return jfu.ravel_pytree(self.problem.y0)[1](x)
-
     def violations(self, times: np.ndarray, rows: np.ndarray) -> np.ndarray:
         """`max_i |g_i|` at each time, absolute (unlike `mj.constraint_violation`)."""
-        problem = self.problem
+        problem, unravel = self.problem, jfu.ravel_pytree(self.problem.y0)[1]
 
         def residual(t, x):
-            return jfu.ravel_pytree(problem.constraint(t, self.unravel(x), problem.args))[0]
+            return jfu.ravel_pytree(problem.constraint(t, unravel(x), problem.args))[0]
 
         g = jax.jit(jax.vmap(residual))(jnp.asarray(times), jnp.asarray(rows))
         return np.max(np.abs(np.asarray(g)), axis=1)

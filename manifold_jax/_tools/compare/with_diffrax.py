@@ -19,19 +19,10 @@ from .task import as_rows, median_ms, Run, SolveFailed, Task
 SOLVERS: dict[str, type[dfx.AbstractSolver]] = {
     solver.__name__.lower(): solver
     for solver in (
-        dfx.Heun,
-        dfx.Midpoint,
-        dfx.Ralston,
-        dfx.Bosh3,
-        dfx.Tsit5,
-        dfx.Dopri5,
-        dfx.Dopri8,
-        dfx.ImplicitEuler,
-        dfx.Kvaerno3,
-        dfx.Kvaerno4,
-        dfx.Kvaerno5,
+        dfx.Heun, dfx.Midpoint, dfx.Ralston, dfx.Bosh3, dfx.Tsit5, dfx.Dopri5, dfx.Dopri8,
+        dfx.ImplicitEuler, dfx.Kvaerno3, dfx.Kvaerno4, dfx.Kvaerno5,
     )
-}
+}  # fmt: skip
 
 # Diffrax has to know the number of steps beforehand: the limit starts at Diffrax's own
 # default and is doubled until the solve finishes, up to about a minute of steps.
