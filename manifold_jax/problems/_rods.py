@@ -1,4 +1,4 @@
-"""Point masses on rigid rods: their equations, reference solutions, and velocities that rods allow."""
+"""Point masses on rigid rods: equations, reference solutions, and velocities that rods allow."""
 
 import functools
 import operator
@@ -62,8 +62,8 @@ def equal_masses(q: Any, args: Any) -> Array:
 
 
 def stretch(d: Any, length2: Any) -> Array:
-    """The residual of rods `d`, `(..., dimensions)`, with the squares of lengths `length2`. Not as a
-    sum over an axis, which XLA would give to a library."""
+    """The residual of rods `d`, `(..., dimensions)`, with the squares of their lengths `length2`.
+    Not as a sum over an axis, which XLA would give to a library."""
     parts = [d[..., i] for i in range(d.shape[-1])]
     return 0.5 * (functools.reduce(operator.add, [x * x for x in parts]) - length2)
 
