@@ -100,8 +100,7 @@ def cable_net(
     - `rows`, `columns`: of knots, two or more.
     - `mass` (kg) of every knot, `length` (m) of every cable, `spacing` of the knots in plan over
         that length, at the start and of the corners for ever, and `gravity` (m/s^2): `args`.
-        `with_args` folds the net anew, also
-        instead of an initial state of yours.
+        `with_args` folds the net anew, also instead of an initial state of yours.
     - `t1`: the end of the time span (s).
 
     Source: classical.
