@@ -30,13 +30,11 @@ class CableNetArgs(NamedTuple):
 
 
 def _cables(t: RealScalarLike, q: Knots, args: CableNetArgs) -> Any:
-    del t
     corners = q[_CORNERS] - _folded(jnp, q.shape, args)[_CORNERS]
     return tuple(stretch(jnp.diff(q, axis=axis), args.length**2) for axis in (0, 1)), corners
 
 
 def _force(t: RealScalarLike, q: Knots, v: Knots, args: CableNetArgs) -> Knots:
-    del t, v
     weight = jnp.zeros(3).at[2].set(-1.0) * args.mass * args.gravity
     return jnp.broadcast_to(weight.astype(q.dtype), q.shape)
 

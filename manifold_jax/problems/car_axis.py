@@ -39,7 +39,6 @@ END = (
 
 
 def _mass(q: Vector, args: CarAxisArgs) -> FloatScalar:
-    del q
     return args.mass * args.epsilon**2 / 2
 
 
@@ -56,7 +55,6 @@ def _linkage(t: RealScalarLike, q: Vector, args: CarAxisArgs) -> Float[Array, "2
 
 
 def _force(t: RealScalarLike, q: Vector, v: Vector, args: CarAxisArgs) -> Vector:
-    del v
     wheel_x, wheel_y = _wheel(t, args)
     xl, yl, xr, yr = q[0], q[1], q[2] - wheel_x, q[3] - wheel_y
     left = args.spring_length / jnp.sqrt(xl**2 + yl**2) - 1

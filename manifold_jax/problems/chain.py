@@ -36,19 +36,16 @@ def _points(links: Float[Array, "N 2"]) -> Points:
 
 
 def _mass(q: Points, args: ChainArgs) -> Points:
-    del q
     return jnp.broadcast_to(args.masses[:, None], (*args.masses.shape, 2)).reshape(-1)
 
 
 def _rods(t: RealScalarLike, q: Points, args: ChainArgs) -> Float[Array, " N"]:
-    del t
     # As a sum over an axis XLA would give it to a library, which does not fuse with what is around.
     x, y = _links(q).T
     return 0.5 * (x * x + y * y - args.lengths**2)
 
 
 def _force(t: RealScalarLike, q: Points, v: Points, args: ChainArgs) -> Points:
-    del t, q, v
     weights = -args.masses * args.gravity
     return jnp.stack([jnp.zeros_like(weights), weights], axis=1).reshape(-1)
 

@@ -28,7 +28,6 @@ class TrussArgs(NamedTuple):
 
 def _bars(t: RealScalarLike, q: Joints, args: TrussArgs) -> Float[Array, " bars"]:
     """Posts, lower and upper chord, and diagonals, by panels."""
-    del t
     lower, upper = q[:, 0], q[:, 1]
     post = stretch(upper - lower, args.height**2)
     chords = (stretch(jnp.diff(chord, axis=0), args.length**2) for chord in (lower, upper))
@@ -38,7 +37,6 @@ def _bars(t: RealScalarLike, q: Joints, args: TrussArgs) -> Float[Array, " bars"
 
 
 def _force(t: RealScalarLike, q: Joints, v: Joints, args: TrussArgs) -> Joints:
-    del t, v
     return jnp.broadcast_to(jnp.stack([0 * args.gravity, -args.mass * args.gravity]), q.shape)
 
 

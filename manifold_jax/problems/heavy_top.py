@@ -59,7 +59,6 @@ def _mass(q: Vector, args: HeavyTopArgs) -> Float[Array, "4 4"]:
 
 
 def _norm(t: RealScalarLike, q: Vector, args: HeavyTopArgs) -> FloatScalar:
-    del t, args
     return jnp.sum(q * q) - 1
 
 
@@ -73,7 +72,6 @@ def _weight(q: Vector, args: HeavyTopArgs) -> FloatScalar:
 def _force(t: RealScalarLike, q: Vector, v: Vector, args: HeavyTopArgs) -> Vector:
     """Return the force of the Lagrangian `(2 G(q) v).I (2 G(q) v) / 2 - V(q)`, with `G(q) v =
     -G(v) q`."""
-    del t
     gyroscopic = -8 * rates_matrix(v).T @ (args.inertia * (rates_matrix(q) @ v))
     return gyroscopic - jax.grad(_weight)(q, args)
 

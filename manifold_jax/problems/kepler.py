@@ -26,14 +26,12 @@ class KeplerArgs(NamedTuple):
 
 
 def _field(t: RealScalarLike, y: State, args: KeplerArgs) -> State:
-    del t
     q, v = y
     r2 = jnp.sum(q * q)
     return v, -args.mu / (r2 * jnp.sqrt(r2)) * q
 
 
 def _invariants(t: RealScalarLike, y: State, args: KeplerArgs) -> tuple[FloatScalar, FloatScalar]:
-    del t
     q, v = y
     energy = 0.5 * jnp.sum(v * v) - args.mu / jnp.sqrt(jnp.sum(q * q))
     return energy, q[0] * v[1] - q[1] * v[0]

@@ -34,7 +34,6 @@ COST_BY_RATES = (
 
 
 def _field(t: RealScalarLike, y: Float[Array, "2"], args: LotkaVolterraArgs) -> Float[Array, "2"]:
-    del t
     p0, p1, p2, p3 = args
     prey, predator = y[0], y[1]
     meetings = prey * predator
@@ -42,7 +41,6 @@ def _field(t: RealScalarLike, y: Float[Array, "2"], args: LotkaVolterraArgs) -> 
 
 
 def _invariant(t: RealScalarLike, y: Float[Array, "2"], args: LotkaVolterraArgs) -> FloatScalar:
-    del t
     p0, p1, p2, p3 = args
     prey, predator = y[0], y[1]
     return p3 * prey - p2 * jnp.log(prey) + p1 * predator - p0 * jnp.log(predator)

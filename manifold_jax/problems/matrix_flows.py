@@ -28,13 +28,11 @@ class SphereFlowArgs(NamedTuple):
 
 
 def _sphere_field(t: RealScalarLike, y: Vector, args: SphereFlowArgs) -> Vector:
-    del t
     image = args.matrix @ y
     return image - jnp.sum(y * image) * y
 
 
 def _sphere_residual(t: RealScalarLike, y: Vector, args: SphereFlowArgs) -> FloatScalar:
-    del t, args
     return jnp.sum(y * y) - 1
 
 
@@ -98,13 +96,11 @@ class RotationArgs(NamedTuple):
 
 
 def _rotation_field(t: RealScalarLike, y: Matrix, args: RotationArgs) -> Matrix:
-    del t
     # row by row: r^T hat(omega) = (r x omega)^T
     return jnp.cross(y, args.omega[None, :])
 
 
 def _rotation_residual(t: RealScalarLike, y: Matrix, args: RotationArgs) -> Float[Array, "6"]:
-    del t, args
     # the upper triangle: the whole symmetric matrix would be 9 dependent equations
     products = [jnp.sum(y[:, i] * y[:, j]) - float(i == j) for i in range(3) for j in range(i, 3)]
     return jnp.stack(products)

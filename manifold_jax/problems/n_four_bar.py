@@ -32,7 +32,6 @@ def _mass(q: Bodies, args: NFourBarArgs) -> Bodies:
 def _joints(t: RealScalarLike, q: Bodies, args: NFourBarArgs) -> Any:
     """Return the gaps of the joints of the crank with the ground, with the coupler before it and
     with that after it."""
-    del t
     half = 0.5 * args.length * jnp.stack([jnp.cos(q[:, 2]), jnp.sin(q[:, 2])], axis=1)
     start, end = q[:, :2] - half, q[:, :2] + half
     pivots = jnp.arange(start[::2].shape[0], dtype=q.dtype) * args.length
@@ -41,7 +40,6 @@ def _joints(t: RealScalarLike, q: Bodies, args: NFourBarArgs) -> Any:
 
 
 def _force(t: RealScalarLike, q: Bodies, v: Bodies, args: NFourBarArgs) -> Bodies:
-    del t, v
     weight = jnp.stack([jnp.zeros_like(args.mass), -args.mass * args.gravity, 0 * args.mass])
     return jnp.broadcast_to(weight, q.shape)
 

@@ -20,12 +20,10 @@ class OscillatorArgs(NamedTuple):
 
 
 def _field(t: RealScalarLike, y: Float[Array, "2"], args: OscillatorArgs) -> Float[Array, "2"]:
-    del t, args
     return jnp.stack([y[1], -y[0]])
 
 
 def _residual(t: RealScalarLike, y: Float[Array, "2"], args: OscillatorArgs) -> Float[Array, ""]:
-    del t
     return jnp.sum(y * y) - args.radius**2
 
 
@@ -36,7 +34,6 @@ def _initial_state(args: OscillatorArgs, start: Float[Array, "2"] | None) -> Flo
 
 
 def _exact(t: np.ndarray, args: OscillatorArgs, y0: np.ndarray) -> np.ndarray:
-    del args
     c, s = np.cos(t), np.sin(t)
     return np.stack([y0[0] * c + y0[1] * s, y0[1] * c - y0[0] * s], axis=-1)
 

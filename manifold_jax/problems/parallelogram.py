@@ -29,7 +29,6 @@ class ParallelogramArgs(NamedTuple):
 
 
 def _mass(q: Vector, args: ParallelogramArgs) -> Vector:
-    del q
     crank = args.crank_mass * args.length**2 / 3
     coupler = [args.coupler_mass, args.coupler_mass, args.coupler_inertia]
     return jnp.stack([*coupler, crank, crank, crank])
@@ -37,7 +36,6 @@ def _mass(q: Vector, args: ParallelogramArgs) -> Vector:
 
 def _joints(t: RealScalarLike, q: Vector, args: ParallelogramArgs) -> Float[Array, "2 3"]:
     """The pins of the coupler less the ends of the cranks."""
-    del t
     pins = args.spacing * jnp.asarray([-1.0, 0.0, 1.0], q.dtype)
     x = q[0] + pins * jnp.cos(q[2]) - pins - args.length * jnp.sin(q[3:])
     y = q[1] + pins * jnp.sin(q[2]) + args.length * jnp.cos(q[3:])
@@ -45,7 +43,6 @@ def _joints(t: RealScalarLike, q: Vector, args: ParallelogramArgs) -> Float[Arra
 
 
 def _force(t: RealScalarLike, q: Vector, v: Vector, args: ParallelogramArgs) -> Vector:
-    del t, v
     zero = jnp.zeros_like(args.gravity)
     coupler = jnp.stack([zero, -args.coupler_mass * args.gravity, zero])
     torques = -0.5 * args.crank_mass * args.gravity * args.length * jnp.sin(q[3:])

@@ -41,23 +41,19 @@ class PendulumArgs(NamedTuple):
 
 
 def point_mass(q: Vector, args: PendulumArgs) -> FloatScalar:
-    del q
     return args.mass
 
 
 def rod(t: RealScalarLike, q: Vector, args: PendulumArgs) -> FloatScalar:
-    del t
     return jnp.sum(q * q) - args.length**2
 
 
 def _force(t: RealScalarLike, q: Vector, v: Vector, args: PendulumArgs) -> Vector:
-    del t, q, v
     return jnp.stack([jnp.zeros_like(args.mass), -args.mass * args.gravity])
 
 
 def _field(t: RealScalarLike, y: State, args: PendulumArgs) -> State:
     """The field of the system, written out; mass cancels."""
-    del t
     q, v = y
     free = jnp.stack([jnp.zeros_like(args.gravity), -args.gravity])
     # q . a + v . v = 0, the second derivative of the constraint

@@ -31,14 +31,12 @@ def _mass(q: Beads, args: PolymerArgs) -> Beads:
 
 
 def _bonds(t: RealScalarLike, q: Beads, args: PolymerArgs) -> Float[Array, " bonds"]:
-    del t
     # Not as a sum over an axis, which XLA would give to a library.
     x, y, z = jnp.diff(q, axis=0).T
     return 0.5 * (x * x + y * y + z * z - args.lengths**2)
 
 
 def _force(t: RealScalarLike, q: Beads, v: Beads, args: PolymerArgs) -> Beads:
-    del t, v
     return _bending(jnp, q, args)
 
 

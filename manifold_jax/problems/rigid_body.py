@@ -23,14 +23,12 @@ class RigidBodyArgs(NamedTuple):
 
 
 def _field(t: RealScalarLike, y: Float[Array, "3"], args: RigidBodyArgs) -> Float[Array, "3"]:
-    del t
     w = y / args.inertia
     cyclic = [(1, 2), (2, 0), (0, 1)]
     return jnp.stack([y[i] * w[j] - y[j] * w[i] for i, j in cyclic])
 
 
 def _invariants(t: RealScalarLike, y: Float[Array, "3"], args: RigidBodyArgs) -> Float[Array, "2"]:
-    del t
     return jnp.stack([jnp.sum(y * y), 0.5 * jnp.sum(y * y / args.inertia)])
 
 

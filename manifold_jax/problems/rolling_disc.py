@@ -28,18 +28,15 @@ class RollingDiscArgs(NamedTuple):
 
 
 def _mass(q: Vector, args: RollingDiscArgs) -> Vector:
-    del q
     return jnp.stack([args.mass, args.mass, args.steering_inertia, args.rolling_inertia])
 
 
 def _no_slip(t: RealScalarLike, q: Vector, v: Vector, args: RollingDiscArgs) -> Float[Array, "2"]:
-    del t
     speed = args.radius * v[3]
     return jnp.stack([v[0] - speed * jnp.cos(q[2]), v[1] - speed * jnp.sin(q[2])])
 
 
 def _force(t: RealScalarLike, q: Vector, v: Vector, args: RollingDiscArgs) -> Vector:
-    del t, v
     downhill = args.mass * args.gravity * jnp.sin(args.slope)
     return jnp.zeros_like(q).at[0].set(downhill)
 

@@ -39,19 +39,16 @@ class SliderCrankArgs(NamedTuple):
 
 
 def _mass(q: Vector, args: SliderCrankArgs) -> Vector:
-    del q
     return jnp.stack([args.crank_inertia, args.slider_mass, args.rod_inertia])
 
 
 def _linkage(t: RealScalarLike, q: Vector, args: SliderCrankArgs) -> Float[Array, "2"]:
-    del t
     crank, x, rod = q[0], q[1], q[2]
     a = args.crank_length
     return jnp.stack([x - jnp.cos(rod) - a * jnp.cos(crank), -jnp.sin(rod) - a * jnp.sin(crank)])
 
 
 def _force(t: RealScalarLike, q: Vector, v: Vector, args: SliderCrankArgs) -> Vector:
-    del t
     crank, x, rod = q[0], q[1], q[2]
     half = 0.5 * args.crank_length
     # from the middle of the crank to the middle of the rod

@@ -23,7 +23,6 @@ AREVALO_T0 = 1.0
 
 
 def _jay2_field(t: RealScalarLike, y: Vector, args: None) -> Vector:
-    del t, args
     y1, y2 = y[0], y[1]
     # the root of 2 y2 z^2 - 3 z + y1^2 = 0 that is 1 / y2 on the manifold
     z = (3 + jnp.sqrt(9 - 8 * y2 * y1**2)) / (4 * y2)
@@ -31,12 +30,10 @@ def _jay2_field(t: RealScalarLike, y: Vector, args: None) -> Vector:
 
 
 def _jay2_residual(t: RealScalarLike, y: Vector, args: None) -> FloatScalar:
-    del t, args
     return y[0] ** 2 * y[1] - 1
 
 
 def _jay2_exact(t: np.ndarray, args: None, y0: np.ndarray) -> np.ndarray:
-    del args
     return np.stack([y0[0] * np.exp(t), y0[1] * np.exp(-2 * t)], axis=-1)
 
 
@@ -70,7 +67,6 @@ def jay2() -> Problem:
 
 
 def _arevalo_field(t: RealScalarLike, y: State, args: None) -> State:
-    del t, args
     q, v = y
     # the force is perpendicular to q, so that the multiplier is centripetal only
     multiplier = jnp.sum(v * v) / jnp.sum(q * q)
@@ -78,14 +74,12 @@ def _arevalo_field(t: RealScalarLike, y: State, args: None) -> State:
 
 
 def _arevalo_residual(t: RealScalarLike, y: State, args: None) -> tuple[FloatScalar, FloatScalar]:
-    del t, args
     q, v = y
     return jnp.sum(q * q) - 1, jnp.sum(q * v)
 
 
 def _arevalo_exact(t: np.ndarray, args: None, y0: Any) -> tuple[np.ndarray, np.ndarray]:
     """Return the exact solution. With `q = (sin p, cos p)` the motion is `p'' = 2`."""
-    del args
     (x, y), (vx, vy) = y0
     elapsed = t - AREVALO_T0
     start, rate = np.arctan2(x, y), vx * y - vy * x
@@ -135,7 +129,6 @@ def _skate_field(t: RealScalarLike, y: State, args: SkateArgs) -> State:
 
 
 def _skate_residual(t: RealScalarLike, y: State, args: SkateArgs) -> FloatScalar:
-    del args
     _, v = y
     return v[1] * jnp.cos(t) - v[0] * jnp.sin(t)
 

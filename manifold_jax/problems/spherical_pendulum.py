@@ -16,7 +16,6 @@ Vector: TypeAlias = Float[Array, "3"]
 
 
 def _force(t: RealScalarLike, q: Vector, v: Vector, args: PendulumArgs) -> Vector:
-    del t, q, v
     zero = jnp.zeros_like(args.mass)
     return jnp.stack([zero, zero, -args.mass * args.gravity])
 

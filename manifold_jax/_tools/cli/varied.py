@@ -118,7 +118,6 @@ class VariedProblem:
         return f"{self.problem.name} with {', '.join(map(str, self.varied))}"
 
     def sample(self, index: Array, key: Array) -> tuple[Any, Given]:
-        del index
         problem = self.problem
         dtype = jfu.ravel_pytree((problem.args, problem.y0))[0].dtype
         keys = jax.random.split(key, len(self.varied))

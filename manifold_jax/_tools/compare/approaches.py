@@ -92,7 +92,6 @@ def default_gain(problem: Problem) -> float:
 
 
 def _plain(problem: Problem, solver: dfx.AbstractSolver, gain: float) -> Formulation:
-    del gain
     return Formulation(dfx.diffeqsolve, problem.terms, solver)
 
 
