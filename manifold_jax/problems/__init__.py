@@ -22,13 +22,12 @@ from .matrix_flows import rotation as rotation, sphere_flow as sphere_flow
 from .n_four_bar import n_four_bar as n_four_bar
 from .oscillator import harmonic_oscillator as harmonic_oscillator
 from .parallelogram import parallelogram as parallelogram
-from .pendulum import pendulum as pendulum
+from .pendulum import pendulum as pendulum, spherical_pendulum as spherical_pendulum
 from .polymer import polymer as polymer
 from .rigid_body import rigid_body as rigid_body
 from .rolling_disc import rolling_disc as rolling_disc
 from .slider_crank import slider_crank as slider_crank
 from .small_daes import arevalo as arevalo, jay2 as jay2, skate as skate
-from .spherical_pendulum import spherical_pendulum as spherical_pendulum
 from .stewart_platform import stewart_platform as stewart_platform
 
 

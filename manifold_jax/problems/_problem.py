@@ -31,9 +31,7 @@ def integrate(
     """
     x0 = np.asarray(x0, np.float64)
     states = np.tile(x0, (t.size, 1))
-    for side in (t > 0, t < 0):
-        if not np.any(side):
-            continue
+    for side in filter(np.any, (t > 0, t < 0)):
         end = t[side][np.argmax(np.abs(t[side]))]
         solution = scipy.integrate.solve_ivp(
             field, (0.0, end), x0, method="DOP853", rtol=3e-14, atol=1e-15, dense_output=True
@@ -90,8 +88,8 @@ class Problem(eqx.Module):
     def __post_init__(self):
         self.args, self.start = jtu.tree_map(as_floating, (self.args, self.start))
         if self.y0 is None:
-            make = self.initial_state
-            self.y0 = self.start if make is None else make(self.args, self.start)
+            rule = self.initial_state
+            self.y0 = self.start if rule is None else rule(self.args, self.start)
         if self.system is not None:
             self.terms = self.system.terms if self.terms is None else self.terms
             self.constraint = self.system.constraint

@@ -3,7 +3,7 @@
 import functools
 import operator
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import jax.numpy as jnp
 import numpy as np
@@ -13,6 +13,9 @@ from jaxtyping import Array
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from ._problem import integrate
+
+
+Force: TypeAlias = Callable[[np.ndarray], np.ndarray]
 
 
 class Rods(NamedTuple):
@@ -40,17 +43,14 @@ class Rods(NamedTuple):
     def vectors(self, points: np.ndarray) -> np.ndarray:
         return points[self.end] - points[self.start]
 
-    def solve(self, d: np.ndarray, b: np.ndarray) -> np.ndarray:
-        """`A^-1 b` at vectors `d` along the rods."""
-        entries = self.weight * np.einsum("kd,kd->k", d[self.i], d[self.j])
-        bands = np.zeros((int((self.i - self.j).max()) + 1, len(d)))
-        bands[self.i - self.j, self.j] = entries
-        return scipy.linalg.solveh_banded(bands, b, lower=True, check_finite=False)
-
     def along(self, d: np.ndarray, b: np.ndarray) -> np.ndarray:
-        """`M^-1 J^T A^-1 b`: the smallest velocities, in the metric of the masses, of which each rod
-        gets `d . d' = b`."""
-        pull = self.solve(d, b)[:, None] * d
+        """`M^-1 J^T A^-1 b` at vectors `d` along the rods: the smallest velocities, in the metric of
+        the masses, of which each rod gets `d . d' = b`."""
+        bands = np.zeros((int((self.i - self.j).max()) + 1, len(d)))
+        products = np.einsum("kd,kd->k", d[self.i], d[self.j])
+        bands[self.i - self.j, self.j] = self.weight * products
+        solved = scipy.linalg.solveh_banded(bands, b, lower=True, check_finite=False)
+        pull = solved[:, None] * d
         rates = np.zeros((self.inverse_masses.size, d.shape[1]))
         np.add.at(rates, self.end, pull)
         np.subtract.at(rates, self.start, pull)
@@ -75,7 +75,7 @@ def allowed(rods: Rods, q: np.ndarray, v: np.ndarray) -> np.ndarray:
 
 
 def rod_field(
-    rods: Rods, force: Callable[[np.ndarray], np.ndarray], dimensions: int
+    rods: Rods, force: Force, dimensions: int
 ) -> Callable[[float, np.ndarray], np.ndarray]:
     """`x' = field(t, x)` of positions and velocities, one after the other, under forces `force(q)`."""
     shape = rods.inverse_masses.size, dimensions
@@ -91,11 +91,7 @@ def rod_field(
 
 
 def solve_rods(
-    rods: Rods,
-    force: Callable[[np.ndarray], np.ndarray],
-    t: np.ndarray,
-    q: np.ndarray,
-    v: np.ndarray,
+    rods: Rods, force: Force, t: np.ndarray, q: np.ndarray, v: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Positions and velocities at times `t`, from those at time 0, of shape `(points, d)`. Nothing is
     projected: rods keep their lengths to the accuracy of the integration."""

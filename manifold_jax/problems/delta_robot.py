@@ -140,8 +140,8 @@ def _exact(t: np.ndarray, args: DeltaRobotArgs, y0: Any) -> State:
         return np.concatenate([u, np.linalg.solve(matrix, right)])
 
     q, v = y0
-    states = integrate(field, np.concatenate([q.position[3], v.position[3]]), t)
-    x, u = states[:, :3], states[:, 3:]
+    start = np.concatenate([q.position[3], v.position[3]])
+    x, u = np.split(integrate(field, start, t), 2, axis=1)
     angle, rate, _ = _arms(np, x, u, args)
     return _bodies(np, x, u, angle, rate, args)
 

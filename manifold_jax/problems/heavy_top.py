@@ -16,7 +16,6 @@ from ._problem import as_floating, integrate, Problem
 
 
 Vector: TypeAlias = Float[Array, "4"]
-State: TypeAlias = tuple[Vector, Vector]
 
 # The axis 0.6 radian from the vertical.
 TILTED = (math.cos(0.3), math.sin(0.3), 0.0, 0.0)

@@ -1,5 +1,6 @@
 """A parallelogram linkage with one crank too many."""
 
+from types import ModuleType
 from typing import Any, NamedTuple, TypeAlias
 
 import jax.numpy as jnp
@@ -52,11 +53,14 @@ def _force(t: RealScalarLike, q: Vector, v: Vector, args: ParallelogramArgs) -> 
 def _initial_state(args: ParallelogramArgs, start: State) -> State:
     """The angles and rates of the cranks, with the length of `args`."""
     (_, _, tilt, *cranks), (_, _, _, rate, *_) = start
-    angle = cranks[0]
-    position = [args.length * jnp.sin(angle), -args.length * jnp.cos(angle)]
-    velocity = [-position[1] * rate, position[0] * rate]
-    v = [*velocity, jnp.zeros_like(rate), rate, rate, rate]
-    return jnp.stack([*position, tilt, *cranks]), jnp.stack(v)
+    return _links(jnp, tilt, cranks, rate, args.length)
+
+
+def _links(xp: ModuleType, tilt: Any, cranks: list, rate: Any, length: Any) -> tuple[Any, Any]:
+    """The state of cranks that turn at one rate, in NumPy or JAX."""
+    x, y, still = length * xp.sin(cranks[0]), -length * xp.cos(cranks[0]), 0 * rate
+    q, v = [x, y, tilt + still, *cranks], [-y * rate, x * rate, still, rate, rate, rate]
+    return xp.stack(q, axis=-1), xp.stack(v, axis=-1)
 
 
 def _exact(t: np.ndarray, args: ParallelogramArgs, y0: Any) -> tuple[np.ndarray, np.ndarray]:
@@ -73,11 +77,7 @@ def _exact(t: np.ndarray, args: ParallelogramArgs, y0: Any) -> tuple[np.ndarray,
         )
     sin_half, cos_half, rate = swing(t, frequency, start, rate)
     angle = 2 * np.arctan2(sin_half, cos_half)
-    still = np.zeros_like(t)
-    x, y = L * np.sin(angle), -L * np.cos(angle)
-    angles = [angle + (crank - start) for crank in cranks]
-    q, v = [x, y, tilt + still, *angles], [-y * rate, x * rate, still, rate, rate, rate]
-    return np.stack(q, axis=-1), np.stack(v, axis=-1)
+    return _links(np, tilt, [angle + (crank - start) for crank in cranks], rate, L)
 
 
 def parallelogram(

@@ -1,6 +1,5 @@
 """A polymer in space: beads on rigid bonds, as in molecular dynamics."""
 
-from collections.abc import Callable
 from typing import Any, NamedTuple, TypeAlias
 
 import jax.numpy as jnp
@@ -10,7 +9,7 @@ from jaxtyping import Array, Float
 from .._base.types import RealScalarLike
 from .._mechanics import MechanicalSystem
 from ._problem import as_floating, Problem, repeated
-from ._rods import allowed, Rods, solve_rods
+from ._rods import allowed, Force, Rods, solve_rods
 
 
 Beads: TypeAlias = Float[Array, "beads 3"]
@@ -75,7 +74,7 @@ def rods(args: PolymerArgs) -> Rods:
     return Rods.between(bead, bead + 1, 1 / args.masses)
 
 
-def force(args: PolymerArgs) -> Callable[[np.ndarray], np.ndarray]:
+def force(args: PolymerArgs) -> Force:
     """Return the force, in NumPy."""
     args = PolymerArgs(*(np.asarray(part) for part in args))
     return lambda q: _bending(np, q, args)

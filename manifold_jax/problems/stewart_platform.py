@@ -69,7 +69,7 @@ def _leg_motion(xp: Any, points: tuple, x: Any, R: Any, u: Any, w: Any) -> tuple
     The universal joint decides about the spin: its second axis stays perpendicular to its first."""
     base, local, first_axes = points
     arms = local @ R.T
-    ends = arms + x
+    ends = arms + x[None, :]
     moving = u[..., None, :] + xp.cross(w[..., None, :], arms)
     length, frames = _legs(xp, base, ends, first_axes)
     second, normal, n = frames[..., 0], frames[..., 1], frames[..., 2]
@@ -95,10 +95,8 @@ def assembly(args: StewartPlatformArgs) -> Assembly:
     turned = _quaternions(jnp, frames)
     for i, (cylinder, piston) in enumerate(zip(CYLINDERS, PISTONS, strict=True)):
         second, n = frames[i, :, 0], frames[i, :, 2]
-        for name, at in (
-            (cylinder, base[i] + CENTER * size * n),
-            (piston, ends[i] - CENTER * size * n),
-        ):
+        below, above = base[i] + CENTER * size * n, ends[i] - CENTER * size * n
+        for name, at in ((cylinder, below), (piston, above)):
             bodies.append(Body(name, mass, moments, position=at, orientation=turned[i]))
         slider = f"leg {i + 1}"
         joints += [

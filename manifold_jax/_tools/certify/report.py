@@ -18,19 +18,16 @@ REVERSE_BOUND, DIFFERENCES_BOUND = 1e-10, 1e-7
 
 
 def certificate_title(combination: Combination) -> str:
-    title = f"{combination.approach}, {combination.solver}"
-    if combination.failure is not None:
-        return f"{title}: {combination.failure}"
-    return f"{title}: {combination.steps} steps"
+    outcome = combination.failure or f"{combination.steps} steps"
+    return f"{combination.approach}, {combination.solver}: {outcome}"
 
 
 def certificate_table(combination: Combination) -> Table:
     """The adjoints of one approach and solver."""
     hessian = any(check.hessian is not None for check in combination.checks)
     headings = ["gradient", "batch", *(["Hessian"] if hessian else ())]
-    table = Table(
-        "adjoint", *number_columns([*headings, "run\n(ms)", "compile\n(s)", "memory\n(kB)"])
-    )
+    headings += ["run\n(ms)", "compile\n(s)", "memory\n(kB)"]
+    table = Table("adjoint", *number_columns(headings))
     for check in combination.checks:
         if check.refused is not None:
             table.add_row(check.adjoint, "refused")

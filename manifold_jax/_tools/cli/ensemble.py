@@ -2,7 +2,7 @@
 
 import time
 from pathlib import Path
-from typing import Annotated, TYPE_CHECKING
+from typing import Annotated, Any, TYPE_CHECKING
 
 import typer
 
@@ -96,11 +96,10 @@ def ensemble(
     title = f"{task.problem.name}: {size} trajectories from t = {task.t0:g} to {task.t1:g}, "
     title += f"{task.solver} projected, rtol {rtol:g}, atol {atol:g}"
     print_lines(output, [title], style="bold")
-    lines = _summary(stored, [str(one) for one in drawn], size - before, seconds)
-    print_lines(output, lines, soft_wrap=True)
+    print_lines(output, _summary(stored, drawn, size - before, seconds), soft_wrap=True)
 
 
-def _summary(stored: "StoredEnsemble", drawn: list[str], new: int, seconds: float) -> list[str]:
+def _summary(stored: "StoredEnsemble", drawn: list[Any], new: int, seconds: float) -> list[str]:
     reasons = stored.failures_by_reason()
     steps, most, violation = 0, 0, 0.0
     for start in range(0, stored.size, stored.chunk):
@@ -109,7 +108,7 @@ def _summary(stored: "StoredEnsemble", drawn: list[str], new: int, seconds: floa
         steps, most = steps + int(count.sum()), max(most, int(count.max()))
         good = stored.ys["violation"][part][stored.result[part] == 0]
         violation = max(violation, float(good.max(initial=0.0)))
-    lines = [f"varied:       {', '.join(drawn)}", f"failed:       {stored.num_failed}"]
+    lines = [f"varied:       {', '.join(map(str, drawn))}", f"failed:       {stored.num_failed}"]
     for reason, (count, first) in reasons.items():
         numbers = ", ".join(map(str, first)) + (", ..." if count > len(first) else "")
         lines.append(f"  {count} (numbers {numbers}): {reason}")

@@ -51,7 +51,7 @@ _HINT = "--vary"
 def distributions(texts: list[str], problem: Problem) -> list[Distribution]:
     """Read a distribution of `NAME=KIND(A,B)` each, or an error that says what could have been
     asked for."""
-    known = _names(problem)
+    known = [*_names_in("args", problem.args), *_names_in("y0", problem.y0)]
     out: list[Distribution] = []
     for text in texts:
         match = re.fullmatch(r"\s*([\w.]+)\s*=\s*(\w+)\s*\(([^,()]+),([^,()]+)\)\s*", text)
@@ -163,13 +163,9 @@ class ConstraintInArgs(AbstractConstraint):
         return self._of(args).faults(t, y, args.args)
 
 
-def _names(problem: Problem) -> list[str]:
-    """The names of all numbers that can be varied: `args.length`, `y0.0.1`."""
-    return [*_names_in("args", problem.args), *_names_in("y0", problem.y0)]
-
-
 def _names_in(name: str, tree: Any) -> list[str]:
-    """The names of the numbers in a tree, in the order in which it is ravelled."""
+    """The names of the numbers in a tree, in the order in which it is ravelled: `args.length`,
+    `y0.0.1`."""
     out = []
     for path, leaf in jtu.tree_flatten_with_path(tree)[0]:
         words = jtu.keystr(path, simple=True, separator=".")

@@ -35,8 +35,7 @@ class Formulation(NamedTuple):
 Formulate = Callable[[Problem, dfx.AbstractSolver, float], Formulation]
 
 
-@dataclasses.dataclass(frozen=True)
-class Need:
+class Need(NamedTuple):
     """What not every problem has: the attribute that is None then, and what it is called."""
 
     attribute: str
@@ -121,9 +120,11 @@ _lie_group = _within(LocalCoordinates, lambda problem, gain: {"chart": problem.c
 def _baumgarte(problem: Problem, solver: dfx.AbstractSolver, gain: float) -> Formulation:
     """Critical damping."""
     assert problem.system is not None
-    stabilization = Baumgarte(gain, gain)
     system = eqx.tree_at(
-        lambda s: s.stabilization, problem.system, stabilization, is_leaf=lambda x: x is None
+        lambda s: s.stabilization,
+        problem.system,
+        Baumgarte(gain, gain),
+        is_leaf=lambda x: x is None,
     )
     return Formulation(dfx.diffeqsolve, system.terms, solver)
 

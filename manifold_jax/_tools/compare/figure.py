@@ -41,13 +41,8 @@ def write_figure(path: Path, task: Task, measurements: Sequence[Measurement]) ->
         _draw_components(first, task, solved, int(np.prod(shape)))
     lines = _draw_violations(second, task, solved)
     _draw_errors(third, task, solved)
-    figure.legend(
-        lines,
-        [m.row.method for m, _ in solved],
-        loc="outside lower center",
-        ncols=min(max(len(solved), 1), 6),
-        frameon=False,
-    )
+    names, columns = [m.row.method for m, _ in solved], min(max(len(solved), 1), 6)
+    figure.legend(lines, names, loc="outside lower center", ncols=columns, frameon=False)
     figure.suptitle(f"{task.problem.name}, rtol = {task.rtol:g}, atol = {task.atol:g}")
     figure.savefig(path, dpi=150)
 

@@ -11,7 +11,6 @@ from typing import Any
 import diffrax
 import jax
 import jax.flatten_util as jfu
-import jax.tree_util as jtu
 import numpy as np
 import scipy
 from rich.markup import escape
@@ -40,11 +39,8 @@ def format_number(value: int | float | str | None, form: str) -> str:
 
 def sizes(problem: Problem) -> tuple[int, int]:
     """The number of states and the number of constraints, `n` and `m`."""
-    residual = jax.eval_shape(problem.constraint, problem.t0, problem.y0, problem.args)
-    return (
-        jfu.ravel_pytree(problem.y0)[0].size,
-        sum(math.prod(leaf.shape) for leaf in jtu.tree_leaves(residual)),
-    )
+    flat = lambda y: jfu.ravel_pytree(problem.constraint(problem.t0, y, problem.args))[0]
+    return jfu.ravel_pytree(problem.y0)[0].size, jax.eval_shape(flat, problem.y0).size
 
 
 def gallery_table(gallery: dict[str, Callable[[], Problem]]) -> Table:

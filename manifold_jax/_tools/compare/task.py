@@ -30,6 +30,13 @@ def median_ms(run: Callable[[], Any]) -> float:
     return 1e3 * statistics.median(durations)
 
 
+def compiled(function: Any, *arguments: Any) -> tuple[jax.stages.Compiled, float]:
+    """The program of a `jax.jit` function, and the seconds it took to trace and compile."""
+    start = time.perf_counter()
+    program = function.lower(*arguments).compile()
+    return program, time.perf_counter() - start
+
+
 # Times at which solutions are compared, both ends included.
 OUTPUT_POINTS = 1001
 

@@ -1,6 +1,5 @@
 """Diffrax's solvers, plain and in the approaches of this library."""
 
-import time
 from collections.abc import Callable
 from typing import Any
 
@@ -12,7 +11,7 @@ import numpy as np
 from ..._solve import diffeqsolve
 from ..._solver import Stabilized
 from .approaches import Approach, Formulation, with_vector_field
-from .task import as_rows, median_ms, Run, SolveFailed, Task
+from .task import as_rows, compiled, median_ms, Run, SolveFailed, Task
 
 
 # Those with an error estimate that take one vector field (KenCarp and Sil3 take two).
@@ -77,9 +76,7 @@ def _compiled(
     run = lambda y0, args: solve_task(task, solve, y0, args, saveat, max_steps)
     # Otherwise the second method profits from what was traced for the first.
     jax.clear_caches()
-    start = time.perf_counter()
-    program = jax.jit(run).lower(problem.y0, problem.args).compile()
-    seconds = time.perf_counter() - start
+    program, seconds = compiled(jax.jit(run), problem.y0, problem.args)
     return lambda: jax.block_until_ready(program(problem.y0, problem.args)), seconds
 
 
