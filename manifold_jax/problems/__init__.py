@@ -22,34 +22,20 @@ from .matrix_flows import rotation as rotation, sphere_flow as sphere_flow
 from .n_four_bar import n_four_bar as n_four_bar
 from .oscillator import harmonic_oscillator as harmonic_oscillator
 from .parallelogram import parallelogram as parallelogram
-from .pendulum import pendulum as pendulum
+from .pendulum import pendulum as pendulum, spherical_pendulum as spherical_pendulum
 from .polymer import polymer as polymer
 from .rigid_body import rigid_body as rigid_body
 from .rolling_disc import rolling_disc as rolling_disc
 from .slider_crank import slider_crank as slider_crank
 from .small_daes import arevalo as arevalo, jay2 as jay2, skate as skate
-from .spherical_pendulum import spherical_pendulum as spherical_pendulum
 from .stewart_platform import stewart_platform as stewart_platform
 
 
 ALL: dict[str, Callable[[], Problem]] = {
-    "harmonic-oscillator": harmonic_oscillator,
-    "pendulum": pendulum,
-    "rigid-body": rigid_body,
-    "kepler": kepler,
-    "lotka-volterra": lotka_volterra,
-    "car-axis": car_axis,
-    "jay2": jay2,
-    "arevalo": arevalo,
-    "skate": skate,
-    "sphere-flow": sphere_flow,
-    "rotation": rotation,
-    "double-pendulum": double_pendulum,
-    "chain": chain,
-    "slider-crank": slider_crank,
-    "four-bar": four_bar,
-    "parallelogram": parallelogram,
-    "spherical-pendulum": spherical_pendulum,
-    "heavy-top": heavy_top,
-    "rolling-disc": rolling_disc,
-}
+    build.__name__.replace("_", "-"): build
+    for build in (
+        harmonic_oscillator, pendulum, rigid_body, kepler, lotka_volterra, car_axis, jay2, arevalo,
+        skate, sphere_flow, rotation, double_pendulum, chain, slider_crank, four_bar, parallelogram,
+        spherical_pendulum, heavy_top, rolling_disc,
+    )
+}  # fmt: skip

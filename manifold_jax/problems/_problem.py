@@ -1,5 +1,6 @@
 """What every member of the gallery is: a vector field on a manifold with a known solution."""
 
+import dataclasses
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -10,9 +11,10 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 import scipy.integrate
+from jaxtyping import Array
 
-from .._base.types import Args, Y
-from .._constraint.constraint import AbstractConstraint
+from .._base.types import Args, ResidualFunction, Y
+from .._constraint.constraint import AbstractConstraint, Invariants
 from .._mechanics import MechanicalSystem
 from .._solver.chart import AbstractChart
 
@@ -29,9 +31,7 @@ def integrate(
     """
     x0 = np.asarray(x0, np.float64)
     states = np.tile(x0, (t.size, 1))
-    for side in (t > 0, t < 0):
-        if not np.any(side):
-            continue
+    for side in filter(np.any, (t > 0, t < 0)):
         end = t[side][np.argmax(np.abs(t[side]))]
         solution = scipy.integrate.solve_ivp(
             field, (0.0, end), x0, method="DOP853", rtol=3e-14, atol=1e-15, dense_output=True
@@ -46,93 +46,55 @@ class Problem(eqx.Module):
     """An initial value problem on a manifold, with its solution.
 
     Built by the functions of `manifold_jax.problems`, not by hand. All callables
-    inside are functions of a module, so that two builds of the same problem share
-    their compiled code.
+    inside are functions of a module: they are compared when compiled code is looked up, so that
+    two builds of the same problem share it.
 
     **Attributes:**
 
     - `name`: the name on the command line, e.g. `"rigid-body"`.
-    - `terms`: the vector field, a `diffrax.ODETerm`.
-    - `constraint`: the manifold.
+    - `terms`: the vector field, a `diffrax.ODETerm`; by default that of the `system`.
+    - `constraint`: the manifold; that of the `system` or of the `invariants`, if there are any.
     - `system`: the [`MechanicalSystem`][] both belong to, or `None` if it is none.
     - `chart`: coordinates made for this manifold, for [`LocalCoordinates`][], or `None`.
-    - `y0`: the initial state at `t0`, on the manifold.
+    - `y0`: the initial state at `t0`, on the manifold; by default `initial_state(args, start)`.
     - `t0`, `t1`: the time span.
     - `args`: named tuple of the physical parameters, or `None` if there are none. Pass
         it as `args` to `diffeqsolve`.
-    - `start`: the initial state given by the user, or `None` for the standard one.
+    - `start`: what the initial state is made from: one given by the user, a standard one, or
+        `None` for the standard one of `args`.
+    - `initial_state`: `(args, start) -> y0`, by default `start` itself.
+    - `invariants`: `(t, y, args)`, what is conserved. Frozen at `y0` they are the constraint.
+    - `exact`: `(t, args, y0) -> y` in NumPy, `t` of shape `(times,)`; the leaves of
+        `y` get that leading axis. Raises `ValueError` where it does not hold.
+    - `reference_at_end_only`: whether `reference` knows the solution at `t1` alone.
     """
 
     name: str = eqx.field(static=True)
-    terms: diffrax.AbstractTerm
-    constraint: AbstractConstraint
-    system: MechanicalSystem | None
-    chart: AbstractChart | None
-    y0: Y
-    t0: float
+    terms: diffrax.AbstractTerm = None  # pyright: ignore[reportAssignmentType]
+    _: dataclasses.KW_ONLY
+    constraint: AbstractConstraint = None  # pyright: ignore[reportAssignmentType]
+    system: MechanicalSystem | None = None
+    chart: AbstractChart | None = None
+    y0: Y = None
+    t0: float = 0.0
     t1: float
-    args: Args
-    start: Y | None
-    _initial_state: Callable[[Any, Any], Y] = eqx.field(static=True)
-    _make_constraint: Callable[[Any, Y], AbstractConstraint] | None = eqx.field(static=True)
-    _exact: Callable[[np.ndarray, Any, Any], Any] = eqx.field(static=True)
-    _at_end_only: bool = eqx.field(static=True)
+    args: Args = None
+    start: Y | None = None
+    initial_state: Callable[[Any, Any], Y] | None = eqx.field(static=True, default=None)
+    invariants: ResidualFunction | None = eqx.field(static=True, default=None)
+    exact: Callable[[np.ndarray, Any, Any], Any] = eqx.field(static=True)
+    reference_at_end_only: bool = eqx.field(static=True, default=False)
 
-    def __init__(
-        self,
-        name: str,
-        terms: diffrax.AbstractTerm | None = None,
-        *,
-        system: MechanicalSystem | None = None,
-        chart: AbstractChart | None = None,
-        t0: float = 0.0,
-        t1: float,
-        args: Args = None,
-        start: Y | None = None,
-        y0: Y | None = None,
-        initial_state: Callable[[Any, Any], Y],
-        make_constraint: Callable[[Any, Y], AbstractConstraint] | None = None,
-        exact: Callable[[np.ndarray, Any, Any], Any],
-        at_end_only: bool = False,
-    ):
-        """**Arguments:**
-
-        - `name`, `terms`, `system`, `chart`, `t0`, `t1`, `args`, `start`: as above. A `system`
-            provides its constraint and, unless they are given, too, its `terms`.
-        - `y0`: the initial state, by default `initial_state(args, start)`.
-        - `initial_state`: `(args, start) -> y0`, where `start` is `None` for the
-            standard start.
-        - `make_constraint`: `(args, y0) -> constraint`, where there is no `system`.
-        - `exact`: `(t, args, y0) -> y` in NumPy, `t` of shape `(times,)`; the leaves of
-            `y` get that leading axis. Raises `ValueError` where it does not hold.
-        - `at_end_only`: whether `exact` knows `t1` alone.
-
-        The callables must be functions of a module: they are compared when compiled
-        code is looked up.
-        """
-        assert (system is None) == (make_constraint is not None)
-        self.name = name
-        self.system = system
-        self.chart = chart
-        self.terms = system.terms if terms is None else terms  # pyright: ignore[reportOptionalMemberAccess]
-        self.t0 = t0
-        self.t1 = t1
-        self.args = jtu.tree_map(as_floating, args)
-        self.start = jtu.tree_map(as_floating, start)
-        self.y0 = initial_state(self.args, self.start) if y0 is None else y0
-        if system is None:
-            self.constraint = make_constraint(self.args, self.y0)  # pyright: ignore
-        else:
-            self.constraint = system.constraint
-        self._initial_state = initial_state
-        self._make_constraint = make_constraint
-        self._exact = exact
-        self._at_end_only = at_end_only
-
-    @property
-    def reference_at_end_only(self) -> bool:
-        """Whether `reference` knows the solution at `t1` alone."""
-        return self._at_end_only
+    def __post_init__(self):
+        self.args, self.start = jtu.tree_map(as_floating, (self.args, self.start))
+        if self.y0 is None:
+            rule = self.initial_state
+            self.y0 = self.start if rule is None else rule(self.args, self.start)
+        if self.system is not None:
+            self.terms = self.system.terms if self.terms is None else self.terms
+            self.constraint = self.system.constraint
+        elif self.invariants is not None:
+            self.constraint = Invariants(self.invariants, y0=self.y0, args=self.args)
 
     def with_args(self, args: Args) -> "Problem":
         """The same problem with other parameters.
@@ -151,7 +113,7 @@ class Problem(eqx.Module):
         An initial state of the user's is kept, unless the docstring of the problem says
         how it moves with the parameters.
         """
-        return self._rebuild(args=args, start=self.start, y0=None)
+        return dataclasses.replace(self, args=args, y0=None)
 
     def with_initial(self, y0: Y) -> "Problem":
         """The same problem from the initial state `y0` at `t0`.
@@ -159,7 +121,7 @@ class Problem(eqx.Module):
         The state is used as it is; values of conserved quantities are frozen there.
         """
         y0 = jtu.tree_map(as_floating, y0)
-        return self._rebuild(args=self.args, start=y0, y0=y0)
+        return dataclasses.replace(self, start=y0, y0=y0)
 
     def reference(self, t: Any) -> Any:
         """The solution from `y0`: exact, or published where no formula is known.
@@ -178,31 +140,14 @@ class Problem(eqx.Module):
         t = np.asarray(t, np.float64)
         if t.ndim > 1:
             raise ValueError(f"`t` must be a scalar or of shape (times,), got shape {t.shape}.")
-        if self._at_end_only and np.any(t != self.t1):
+        if self.reference_at_end_only and np.any(t != self.t1):
             raise ValueError(
                 f"The solution of `{self.name}` is known at the end of its time span only: "
                 f"call `reference({self.t1})`, i.e. `problem.reference(problem.t1)`."
             )
         args, y0 = jtu.tree_map(lambda leaf: np.asarray(leaf, np.float64), (self.args, self.y0))
-        y = self._exact(np.atleast_1d(t), args, y0)
+        y = self.exact(np.atleast_1d(t), args, y0)
         return y if t.ndim == 1 else jtu.tree_map(lambda leaf: leaf[0], y)
-
-    def _rebuild(self, *, args: Args, start: Y | None, y0: Y | None) -> "Problem":
-        return Problem(
-            self.name,
-            self.terms,
-            system=self.system,
-            chart=self.chart,
-            t0=self.t0,
-            t1=self.t1,
-            args=args,
-            start=start,
-            y0=y0,
-            initial_state=self._initial_state,
-            make_constraint=self._make_constraint,
-            exact=self._exact,
-            at_end_only=self._at_end_only,
-        )
 
 
 def require_standard(name: str, standard: Any, actual: Any) -> None:
@@ -223,3 +168,13 @@ def as_floating(leaf: Any) -> Any:
     if isinstance(leaf, jax.Array) and jnp.issubdtype(leaf.dtype, jnp.floating):
         return leaf
     return jnp.asarray(leaf, float)
+
+
+def repeated(value: Any, number: int, what: str, each: str = "") -> Array:
+    """A parameter of each of `number` things, given as an array or as one number for all."""
+    value = as_floating(value)
+    if value.shape not in ((), (number,)):
+        raise ValueError(
+            f"`{what}` must be a scalar or of shape ({number},){each}, got {value.shape}."
+        )
+    return jnp.broadcast_to(value, (number,))

@@ -1,14 +1,21 @@
-"""Point masses on rigid rods: their reference solution, and velocities that the rods allow."""
+"""Point masses on rigid rods: equations, reference solutions, and velocities that rods allow."""
 
+import functools
+import operator
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
+import jax.numpy as jnp
 import numpy as np
 import scipy.linalg
 import scipy.sparse as sp
+from jaxtyping import Array
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from ._problem import integrate
+
+
+Force: TypeAlias = Callable[[np.ndarray], np.ndarray]
 
 
 class Rods(NamedTuple):
@@ -36,21 +43,29 @@ class Rods(NamedTuple):
     def vectors(self, points: np.ndarray) -> np.ndarray:
         return points[self.end] - points[self.start]
 
-    def solve(self, d: np.ndarray, b: np.ndarray) -> np.ndarray:
-        """`A^-1 b` at vectors `d` along the rods."""
-        entries = self.weight * np.einsum("kd,kd->k", d[self.i], d[self.j])
-        bands = np.zeros((int((self.i - self.j).max()) + 1, len(d)))
-        bands[self.i - self.j, self.j] = entries
-        return scipy.linalg.solveh_banded(bands, b, lower=True, check_finite=False)
-
     def along(self, d: np.ndarray, b: np.ndarray) -> np.ndarray:
-        """`M^-1 J^T A^-1 b`: the smallest velocities, in the metric of the masses, of which each rod
-        gets `d . d' = b`."""
-        pull = self.solve(d, b)[:, None] * d
+        """`M^-1 J^T A^-1 b` at vectors `d` along the rods: the smallest velocities, in the metric of
+        the masses, of which each rod gets `d . d' = b`."""
+        bands = np.zeros((int((self.i - self.j).max()) + 1, len(d)))
+        products = np.einsum("kd,kd->k", d[self.i], d[self.j])
+        bands[self.i - self.j, self.j] = self.weight * products
+        solved = scipy.linalg.solveh_banded(bands, b, lower=True, check_finite=False)
+        pull = solved[:, None] * d
         rates = np.zeros((self.inverse_masses.size, d.shape[1]))
         np.add.at(rates, self.end, pull)
         np.subtract.at(rates, self.start, pull)
         return self.inverse_masses[:, None] * rates
+
+
+def equal_masses(q: Any, args: Any) -> Array:
+    return jnp.broadcast_to(args.mass, q.shape)
+
+
+def stretch(d: Any, length2: Any) -> Array:
+    """The residual of rods `d`, `(..., dimensions)`, with the squares of their lengths `length2`.
+    Not as a sum over an axis, which XLA would give to a library."""
+    parts = [d[..., i] for i in range(d.shape[-1])]
+    return 0.5 * (functools.reduce(operator.add, [x * x for x in parts]) - length2)
 
 
 def allowed(rods: Rods, q: np.ndarray, v: np.ndarray) -> np.ndarray:
@@ -60,7 +75,7 @@ def allowed(rods: Rods, q: np.ndarray, v: np.ndarray) -> np.ndarray:
 
 
 def rod_field(
-    rods: Rods, force: Callable[[np.ndarray], np.ndarray], dimensions: int
+    rods: Rods, force: Force, dimensions: int
 ) -> Callable[[float, np.ndarray], np.ndarray]:
     """`x' = field(t, x)` of positions and velocities, one after the other, under forces `force(q)`."""
     shape = rods.inverse_masses.size, dimensions
@@ -76,11 +91,7 @@ def rod_field(
 
 
 def solve_rods(
-    rods: Rods,
-    force: Callable[[np.ndarray], np.ndarray],
-    t: np.ndarray,
-    q: np.ndarray,
-    v: np.ndarray,
+    rods: Rods, force: Force, t: np.ndarray, q: np.ndarray, v: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Positions and velocities at times `t`, from those at time 0, of shape `(points, d)`. Nothing is
     projected: rods keep their lengths to the accuracy of the integration."""

@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 from .._base.types import RealScalarLike
 from .._mechanics import MechanicalSystem
 from ._problem import as_floating, Problem
-from ._rods import Rods, solve_rods
+from ._rods import equal_masses, Rods, solve_rods, stretch
 
 
 Knots: TypeAlias = Float[Array, "rows columns 3"]
@@ -29,23 +29,12 @@ class CableNetArgs(NamedTuple):
     gravity: Any
 
 
-def _mass(q: Knots, args: CableNetArgs) -> Knots:
-    return jnp.broadcast_to(args.mass, q.shape)
-
-
 def _cables(t: RealScalarLike, q: Knots, args: CableNetArgs) -> Any:
-    del t
     corners = q[_CORNERS] - _folded(jnp, q.shape, args)[_CORNERS]
-    return tuple(_stretch(jnp.diff(q, axis=axis), args) for axis in (0, 1)), corners
-
-
-def _stretch(d: Float[Array, "i j 3"], args: CableNetArgs) -> Float[Array, "i j"]:
-    x, y, z = d[..., 0], d[..., 1], d[..., 2]
-    return 0.5 * (x * x + y * y + z * z - args.length**2)
+    return tuple(stretch(jnp.diff(q, axis=axis), args.length**2) for axis in (0, 1)), corners
 
 
 def _force(t: RealScalarLike, q: Knots, v: Knots, args: CableNetArgs) -> Knots:
-    del t, v
     weight = jnp.zeros(3).at[2].set(-1.0) * args.mass * args.gravity
     return jnp.broadcast_to(weight.astype(q.dtype), q.shape)
 
@@ -109,8 +98,7 @@ def cable_net(
     - `rows`, `columns`: of knots, two or more.
     - `mass` (kg) of every knot, `length` (m) of every cable, `spacing` of the knots in plan over
         that length, at the start and of the corners for ever, and `gravity` (m/s^2): `args`.
-        `with_args` folds the net anew, also
-        instead of an initial state of yours.
+        `with_args` folds the net anew, also instead of an initial state of yours.
     - `t1`: the end of the time span (s).
 
     Source: classical.
@@ -120,7 +108,7 @@ def cable_net(
     args = CableNetArgs(*map(as_floating, (mass, length, spacing, gravity)))
     return Problem(
         "cable-net",
-        system=MechanicalSystem(_mass, _cables, _force),
+        system=MechanicalSystem(equal_masses, _cables, _force),
         t1=t1,
         args=args,
         start=(jnp.zeros((rows, columns, 3)), jnp.zeros((rows, columns, 3))),

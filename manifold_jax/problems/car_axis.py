@@ -11,7 +11,8 @@ from .._mechanics import MechanicalSystem
 from ._problem import Problem, require_standard
 
 
-State: TypeAlias = tuple[Float[Array, "4"], Float[Array, "4"]]
+Vector: TypeAlias = Float[Array, "4"]
+State: TypeAlias = tuple[Vector, Vector]
 
 
 class CarAxisArgs(NamedTuple):
@@ -30,23 +31,14 @@ class CarAxisArgs(NamedTuple):
 # Solvers, problem caraxis, the version printed with 21 digits. Right to 2e-13 (position)
 # and 5e-12 (velocity; the worst is the second component).
 END = (
-    (
-        0.493455784275402809122e-1,
-        0.496989460230171153861,
-        0.104174252488542151681e1,
-        0.373911027265361256927,
-    ),
-    (
-        -0.770583684040972357970e-1,
-        0.744686658723778553466e-2,
-        0.175568157537232222276e-1,
-        0.770341043779251976443,
-    ),
-)
+    (0.493455784275402809122e-1, 0.496989460230171153861,
+     0.104174252488542151681e1, 0.373911027265361256927),
+    (-0.770583684040972357970e-1, 0.744686658723778553466e-2,
+     0.175568157537232222276e-1, 0.770341043779251976443),
+)  # fmt: skip
 
 
-def _mass(q: Float[Array, "4"], args: CarAxisArgs) -> FloatScalar:
-    del q
+def _mass(q: Vector, args: CarAxisArgs) -> FloatScalar:
     return args.mass * args.epsilon**2 / 2
 
 
@@ -56,16 +48,13 @@ def _wheel(t: RealScalarLike, args: CarAxisArgs) -> tuple[FloatScalar, FloatScal
     return jnp.sqrt(args.length**2 - y**2), y
 
 
-def _linkage(t: RealScalarLike, q: Float[Array, "4"], args: CarAxisArgs) -> Float[Array, "2"]:
+def _linkage(t: RealScalarLike, q: Vector, args: CarAxisArgs) -> Float[Array, "2"]:
     wheel_x, wheel_y = _wheel(t, args)
     dx, dy = q[0] - q[2], q[1] - q[3]
     return jnp.stack([wheel_x * q[0] + wheel_y * q[1], dx**2 + dy**2 - args.length**2])
 
 
-def _force(
-    t: RealScalarLike, q: Float[Array, "4"], v: Float[Array, "4"], args: CarAxisArgs
-) -> Float[Array, "4"]:
-    del v
+def _force(t: RealScalarLike, q: Vector, v: Vector, args: CarAxisArgs) -> Vector:
     wheel_x, wheel_y = _wheel(t, args)
     xl, yl, xr, yr = q[0], q[1], q[2] - wheel_x, q[3] - wheel_y
     left = args.spring_length / jnp.sqrt(xl**2 + yl**2) - 1
@@ -132,20 +121,15 @@ def car_axis(
     Source: Mazzia & Magherini, Test Set for Initial Value Problem Solvers, problem
     caraxis.
     """
+    args = CarAxisArgs(
+        mass, epsilon, length, spring_length, road_amplitude, road_frequency, gravity
+    )
     return Problem(
         "car-axis",
         system=MechanicalSystem(_mass, _linkage, _force),
         t1=3.0,
-        args=CarAxisArgs(
-            mass,
-            epsilon,
-            length,
-            spring_length,
-            road_amplitude,
-            road_frequency,
-            gravity,
-        ),
+        args=args,
         initial_state=_initial_state,
         exact=_exact,
-        at_end_only=True,
+        reference_at_end_only=True,
     )

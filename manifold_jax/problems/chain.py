@@ -9,10 +9,11 @@ from jaxtyping import Array, Float
 
 from .._base.types import RealScalarLike
 from .._mechanics import MechanicalSystem
-from ._problem import as_floating, integrate, Problem
+from ._problem import integrate, Problem, repeated
 
 
-State: TypeAlias = tuple[Float[Array, " n"], Float[Array, " n"]]
+Points: TypeAlias = Float[Array, " n"]
+State: TypeAlias = tuple[Points, Points]
 
 
 class ChainArgs(NamedTuple):
@@ -24,32 +25,27 @@ class ChainArgs(NamedTuple):
     gravity: Any
 
 
-def _links(points: Float[Array, " n"]) -> Float[Array, "N 2"]:
+def _links(points: Points) -> Float[Array, "N 2"]:
     """Return the links from the points `(x1, y1, x2, y2, ...)` to the vectors between them, the
     support first."""
     return jnp.diff(points.reshape(-1, 2), axis=0, prepend=jnp.zeros((1, 2), points.dtype))
 
 
-def _points(links: Float[Array, "N 2"]) -> Float[Array, " n"]:
+def _points(links: Float[Array, "N 2"]) -> Points:
     return jnp.cumsum(links, axis=0).reshape(-1)
 
 
-def _mass(q: Float[Array, " n"], args: ChainArgs) -> Float[Array, " n"]:
-    del q
+def _mass(q: Points, args: ChainArgs) -> Points:
     return jnp.broadcast_to(args.masses[:, None], (*args.masses.shape, 2)).reshape(-1)
 
 
-def _rods(t: RealScalarLike, q: Float[Array, " n"], args: ChainArgs) -> Float[Array, " N"]:
-    del t
+def _rods(t: RealScalarLike, q: Points, args: ChainArgs) -> Float[Array, " N"]:
     # As a sum over an axis XLA would give it to a library, which does not fuse with what is around.
     x, y = _links(q).T
     return 0.5 * (x * x + y * y - args.lengths**2)
 
 
-def _force(
-    t: RealScalarLike, q: Float[Array, " n"], v: Float[Array, " n"], args: ChainArgs
-) -> Float[Array, " n"]:
-    del t, q, v
+def _force(t: RealScalarLike, q: Points, v: Points, args: ChainArgs) -> Points:
     weights = -args.masses * args.gravity
     return jnp.stack([jnp.zeros_like(weights), weights], axis=1).reshape(-1)
 
@@ -168,27 +164,17 @@ def chain(
 
 
 def _build(name: str, links: int, args: tuple, angles: Any, rates: Any, t1: float) -> Problem:
-    def per_link(value: Any, what: str) -> Array:
-        value = as_floating(value)
-        if value.shape not in ((), (links,)):
-            raise ValueError(
-                f"`{what}` must be a scalar or of shape ({links},), one per link, got {value.shape}."
-            )
-        return jnp.broadcast_to(value, (links,))
-
+    per_link = lambda value, what: repeated(value, links, what, ", one per link")
     masses, lengths = per_link(args[0], "masses"), per_link(args[1], "lengths")
     angles, rates = per_link(angles, "angles"), per_link(rates, "rates")
     s, c = jnp.sin(angles), jnp.cos(angles)
-    start = (
-        _points(jnp.stack([s, -c], axis=1)),
-        _points(jnp.stack([rates * c, rates * s], axis=1)),
-    )
+    positions, velocities = jnp.stack([s, -c], axis=1), jnp.stack([rates * c, rates * s], axis=1)
     return Problem(
         name,
         system=MechanicalSystem(_mass, _rods, _force),
         t1=t1,
         args=ChainArgs(masses, lengths, args[2]),
-        start=start,
+        start=(_points(positions), _points(velocities)),
         initial_state=_initial_state,
         exact=_exact,
     )

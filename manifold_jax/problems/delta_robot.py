@@ -71,14 +71,17 @@ def _initial_state(args: DeltaRobotArgs, start: State) -> State:
     return _bodies(jnp, q.position[3], v.position[3], angle, rate, args)
 
 
+def _directions(xp: ModuleType, dtype: Any, fraction: float = 1.0) -> tuple[Any, Any]:
+    """Cosines and sines of the directions of the arms, or of a fraction of these angles."""
+    angles = fraction * np.array(DIRECTIONS)
+    return xp.asarray(np.cos(angles), dtype), xp.asarray(np.sin(angles), dtype)
+
+
 def _arms(xp: ModuleType, x: Any, u: Any, args: Any) -> tuple[Any, Any, tuple]:
     """Angles of the arms below the horizontal, their rates, and rods `n` with the directions of the
     arms and their derivatives; in NumPy or JAX, for positions of the platform `(..., 3)`."""
-    L, directions = args.arm_length, np.array(DIRECTIONS)
-    cosines, sines = (
-        xp.asarray(np.cos(directions), L.dtype),
-        xp.asarray(np.sin(directions), L.dtype),
-    )
+    L = args.arm_length
+    cosines, sines = _directions(xp, L.dtype)
     flat = lambda a: a[..., 0:1] * cosines + a[..., 1:2] * sines  # radial parts
     across = lambda a: a[..., 1:2] * cosines - a[..., 0:1] * sines
     radial = flat(x) + args.platform_radius - args.base_radius  # from the hinges to the wrists
@@ -96,15 +99,13 @@ def _arms(xp: ModuleType, x: Any, u: Any, args: Any) -> tuple[Any, Any, tuple]:
 
 def _bodies(xp: ModuleType, x: Any, u: Any, angle: Any, rate: Any, args: Any) -> State:
     """Poses and rates of arms and platform; the leading axes are those of `x`."""
-    directions = np.array(DIRECTIONS)
-    dtype = args.arm_length.dtype
-    cosines, sines = xp.asarray(np.cos(directions), dtype), xp.asarray(np.sin(directions), dtype)
+    cosines, sines = _directions(xp, args.arm_length.dtype)
     s, c, half = xp.sin(angle), xp.cos(angle), args.arm_length / 2
     out, fast = args.base_radius + half * c, -half * s * rate
     arms = xp.stack([out * cosines, out * sines, -half * s], axis=-1)
     moving = xp.stack([fast * cosines, fast * sines, -half * c * rate], axis=-1)
     # the turn about the vertical after that about the hinge
-    a, b = xp.asarray(np.cos(directions / 2), dtype), xp.asarray(np.sin(directions / 2), dtype)
+    a, b = _directions(xp, args.arm_length.dtype, 0.5)
     s, c = xp.sin(angle / 2), xp.cos(angle / 2)
     turned = xp.stack([a * c, -b * s, a * s, b * c], axis=-1)
     turning = xp.stack([-a * s, -b * c, a * c, -b * s], axis=-1) * rate[..., None] / 2
@@ -124,16 +125,13 @@ def _exact(t: np.ndarray, args: DeltaRobotArgs, y0: Any) -> State:
     """
     L, mass, g = args.arm_length, args.platform_mass, float(args.gravity)
     inertia = args.arm_mass * L**2 / 3
-    directions = np.array(DIRECTIONS)
+    cosines, sines = _directions(np, np.float64)
 
     def field(t, state):
         x, u = state[:3], state[3:]
         angle, rate, (rods, speed, lever, s, c) = _arms(np, x, u, args)
-        cosines, sines = np.cos(directions), np.sin(directions)
-        gradients = np.stack(
-            [rods[0] * cosines - rods[1] * sines, rods[0] * sines + rods[1] * cosines, rods[2]]
-        )
-        gradients = gradients / lever
+        x_part, y_part = rods[0] * cosines - rods[1] * sines, rods[0] * sines + rods[1] * cosines
+        gradients = np.stack([x_part, y_part, rods[2]]) / lever
         across = (speed[0] + L * s * rate) ** 2 + speed[1] ** 2 + (speed[2] + L * c * rate) ** 2
         bias = (L * (rods[0] * c - rods[2] * s) * rate**2 + across) / lever
         torque = args.arm_mass * g * L / 2 * c - args.stiffness * angle
@@ -142,8 +140,8 @@ def _exact(t: np.ndarray, args: DeltaRobotArgs, y0: Any) -> State:
         return np.concatenate([u, np.linalg.solve(matrix, right)])
 
     q, v = y0
-    states = integrate(field, np.concatenate([q.position[3], v.position[3]]), t)
-    x, u = states[:, :3], states[:, 3:]
+    start = np.concatenate([q.position[3], v.position[3]])
+    x, u = np.split(integrate(field, start, t), 2, axis=1)
     angle, rate, _ = _arms(np, x, u, args)
     return _bodies(np, x, u, angle, rate, args)
 

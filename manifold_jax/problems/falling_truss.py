@@ -9,6 +9,7 @@ from jaxtyping import Array, Float
 from .._base.types import RealScalarLike
 from .._mechanics import MechanicalSystem
 from ._problem import as_floating, Problem
+from ._rods import equal_masses, stretch
 
 
 Joints: TypeAlias = Float[Array, "joints 2 2"]
@@ -25,27 +26,17 @@ class TrussArgs(NamedTuple):
     gravity: Any
 
 
-def _mass(q: Joints, args: TrussArgs) -> Joints:
-    return jnp.broadcast_to(args.mass, q.shape)
-
-
 def _bars(t: RealScalarLike, q: Joints, args: TrussArgs) -> Float[Array, " bars"]:
     """Posts, lower and upper chord, and diagonals, by panels."""
-    del t
     lower, upper = q[:, 0], q[:, 1]
-    post = _stretch(upper - lower, args.height**2)
-    chords = (_stretch(jnp.diff(chord, axis=0), args.length**2) for chord in (lower, upper))
-    diagonal = _stretch(upper[1:] - lower[:-1], args.length**2 + args.height**2)
+    post = stretch(upper - lower, args.height**2)
+    chords = (stretch(jnp.diff(chord, axis=0), args.length**2) for chord in (lower, upper))
+    diagonal = stretch(upper[1:] - lower[:-1], args.length**2 + args.height**2)
     panels = jnp.stack([*chords, diagonal, post[1:]], axis=1)
     return jnp.concatenate([post[:1], panels.reshape(-1)])
 
 
-def _stretch(d: Float[Array, "bars 2"], length2: Any) -> Float[Array, " bars"]:
-    return 0.5 * (d[:, 0] * d[:, 0] + d[:, 1] * d[:, 1] - length2)
-
-
 def _force(t: RealScalarLike, q: Joints, v: Joints, args: TrussArgs) -> Joints:
-    del t, v
     return jnp.broadcast_to(jnp.stack([0 * args.gravity, -args.mass * args.gravity]), q.shape)
 
 
@@ -123,7 +114,7 @@ def falling_truss(
     motion = jnp.zeros(2), as_floating(velocity), jnp.asarray(0.0), as_floating(rate)
     return Problem(
         "falling-truss",
-        system=MechanicalSystem(_mass, _bars, _force),
+        system=MechanicalSystem(equal_masses, _bars, _force),
         t1=t1,
         args=args,
         start=_moved(jnp, *motion, args, panels + 1),

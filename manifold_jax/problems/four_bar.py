@@ -28,14 +28,12 @@ class FourBarArgs(NamedTuple):
 
 
 def _mass(q: Vector, args: FourBarArgs) -> Vector:
-    del q
     inertia = args.masses * args.lengths[:3] ** 2 / 12
     return jnp.stack([args.masses, args.masses, inertia], axis=1).reshape(-1)
 
 
 def _joints(t: RealScalarLike, q: Vector, args: FourBarArgs) -> Float[Array, "4 2"]:
     """Pivot of the crank, crank to coupler, coupler to rocker, pivot of the rocker."""
-    del t
     x, y, angle = q[0::3], q[1::3], q[2::3]
     centers = jnp.stack([x, y], axis=1)
     halves = jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=1) * (0.5 * args.lengths[:3, None])
@@ -45,7 +43,6 @@ def _joints(t: RealScalarLike, q: Vector, args: FourBarArgs) -> Float[Array, "4 
 
 
 def _force(t: RealScalarLike, q: Vector, v: Vector, args: FourBarArgs) -> Vector:
-    del t, q, v
     zero = jnp.zeros_like(args.masses)
     return jnp.stack([zero, -args.masses * args.gravity, zero], axis=1).reshape(-1)
 

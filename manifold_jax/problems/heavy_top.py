@@ -1,6 +1,7 @@
 """The heavy top with its attitude as a unit quaternion: a singular mass matrix."""
 
 import math
+from collections.abc import Sequence
 from typing import Any, NamedTuple, TypeAlias
 
 import jax
@@ -10,11 +11,11 @@ from jaxtyping import Array, Float
 
 from .._base.types import FloatScalar, RealScalarLike
 from .._mechanics import MechanicalSystem
+from .._multibody.rotations import rates_matrix
 from ._problem import as_floating, integrate, Problem
 
 
 Vector: TypeAlias = Float[Array, "4"]
-State: TypeAlias = tuple[Vector, Vector]
 
 # The axis 0.6 radian from the vertical.
 TILTED = (math.cos(0.3), math.sin(0.3), 0.0, 0.0)
@@ -36,11 +37,8 @@ BENCHMARK = dict(
 # tests/regression_tests/regression/verification/dynamic_heavy_top.cpp.
 BENCHMARK_DISPLACEMENT = (-0.150416985652933, -1.724164450779749, -0.673023460701136)
 BENCHMARK_QUATERNION = (
-    0.122947275600560,
-    -0.491079359219981,
-    0.350430794926147,
-    -0.787986857972906,
-)
+    0.122947275600560, -0.491079359219981, 0.350430794926147, -0.787986857972906,
+)  # fmt: skip
 
 
 class HeavyTopArgs(NamedTuple):
@@ -54,20 +52,12 @@ class HeavyTopArgs(NamedTuple):
     gravity: Any
 
 
-def _rates(q: Vector) -> Float[Array, "3 4"]:
-    """`G(q)`: the angular velocity in the frame of the body is `2 G(q) q'`."""
-    a, b, c, d = q[0], q[1], q[2], q[3]
-    rows = [[-b, a, d, -c], [-c, -d, a, b], [-d, c, -b, a]]
-    return jnp.stack([jnp.stack(row) for row in rows])
-
-
 def _mass(q: Vector, args: HeavyTopArgs) -> Float[Array, "4 4"]:
-    G = _rates(q)
+    G = rates_matrix(q)
     return 4 * (G.T * args.inertia[None, :]) @ G
 
 
 def _norm(t: RealScalarLike, q: Vector, args: HeavyTopArgs) -> FloatScalar:
-    del t, args
     return jnp.sum(q * q) - 1
 
 
@@ -81,14 +71,8 @@ def _weight(q: Vector, args: HeavyTopArgs) -> FloatScalar:
 def _force(t: RealScalarLike, q: Vector, v: Vector, args: HeavyTopArgs) -> Vector:
     """Return the force of the Lagrangian `(2 G(q) v).I (2 G(q) v) / 2 - V(q)`, with `G(q) v =
     -G(v) q`."""
-    del t
-    gyroscopic = -8 * _rates(v).T @ (args.inertia * (_rates(q) @ v))
+    gyroscopic = -8 * rates_matrix(v).T @ (args.inertia * (rates_matrix(q) @ v))
     return gyroscopic - jax.grad(_weight)(q, args)
-
-
-def _initial_state(args: HeavyTopArgs, start: State) -> State:
-    del args
-    return start
 
 
 def _exact(t: np.ndarray, args: HeavyTopArgs, y0: Any) -> tuple[np.ndarray, np.ndarray]:
@@ -98,13 +82,11 @@ def _exact(t: np.ndarray, args: HeavyTopArgs, y0: Any) -> tuple[np.ndarray, np.n
     load = (float(args.mass * args.gravity) * args.center).tolist()
 
     def field(t, x):
-        a, b, c, d, w1, w2, w3 = x.tolist()
+        numbers = x.tolist()
+        a, b, c, d, w1, w2, w3 = numbers
         up1, up2, up3 = 2 * (b * d - a * c), 2 * (c * d + a * b), a * a - b * b - c * c + d * d
         return (
-            0.5 * (-b * w1 - c * w2 - d * w3),
-            0.5 * (a * w1 + c * w3 - d * w2),
-            0.5 * (a * w2 + d * w1 - b * w3),
-            0.5 * (a * w3 + b * w2 - c * w1),
+            *_quaternion_rates(numbers),
             ((I2 - I3) * w2 * w3 - load[1] * up3 + load[2] * up2) / I1,
             ((I3 - I1) * w3 * w1 - load[2] * up1 + load[0] * up3) / I2,
             ((I1 - I2) * w1 * w2 - load[0] * up2 + load[1] * up1) / I3,
@@ -114,15 +96,19 @@ def _exact(t: np.ndarray, args: HeavyTopArgs, y0: Any) -> tuple[np.ndarray, np.n
     spin = 2 * np.array([[-b, a, d, -c], [-c, -d, a, b], [-d, c, -b, a]]) @ v0
     states = integrate(field, np.concatenate([y0[0], spin]), t)
     q = states[:, :4] / np.linalg.norm(states[:, :4], axis=1, keepdims=True)
-    a, b, c, d = q.T
-    w1, w2, w3 = states[:, 4:].T
-    v = [
-        -b * w1 - c * w2 - d * w3,
-        a * w1 + c * w3 - d * w2,
-        a * w2 + d * w1 - b * w3,
-        a * w3 + b * w2 - c * w1,
-    ]
-    return q, 0.5 * np.stack(v, axis=-1)
+    v = _quaternion_rates([*q.T, *states[:, 4:].T])
+    return q, np.stack(v, axis=-1)
+
+
+def _quaternion_rates(x: Sequence[Any]) -> tuple[Any, Any, Any, Any]:
+    """The product of quaternions `p w / 2` of `x = (p, w)`, numbers or arrays."""
+    a, b, c, d, w1, w2, w3 = x
+    return (
+        0.5 * (-b * w1 - c * w2 - d * w3),
+        0.5 * (a * w1 + c * w3 - d * w2),
+        0.5 * (a * w2 + d * w1 - b * w3),
+        0.5 * (a * w3 + b * w2 - c * w1),
+    )
 
 
 def heavy_top(
@@ -179,7 +165,6 @@ def heavy_top(
         system=MechanicalSystem(_mass, _norm, _force),
         t1=t1,
         args=HeavyTopArgs(mass, as_floating(inertia), as_floating(center), gravity),
-        start=(q, 0.5 * _rates(q).T @ as_floating(spin)),
-        initial_state=_initial_state,
+        start=(q, 0.5 * rates_matrix(q).T @ as_floating(spin)),
         exact=_exact,
     )

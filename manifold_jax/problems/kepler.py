@@ -9,7 +9,6 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._base.types import FloatScalar, RealScalarLike
-from .._constraint.constraint import Invariants
 from ._problem import Problem
 
 
@@ -27,14 +26,12 @@ class KeplerArgs(NamedTuple):
 
 
 def _field(t: RealScalarLike, y: State, args: KeplerArgs) -> State:
-    del t
     q, v = y
     r2 = jnp.sum(q * q)
     return v, -args.mu / (r2 * jnp.sqrt(r2)) * q
 
 
 def _invariants(t: RealScalarLike, y: State, args: KeplerArgs) -> tuple[FloatScalar, FloatScalar]:
-    del t
     q, v = y
     energy = 0.5 * jnp.sum(v * v) - args.mu / jnp.sqrt(jnp.sum(q * q))
     return energy, q[0] * v[1] - q[1] * v[0]
@@ -46,10 +43,6 @@ def _initial_state(args: KeplerArgs, start: State | None) -> State:
     mu, e = args
     zero = jnp.zeros_like(e)
     return jnp.stack([1 - e, zero]), jnp.stack([zero, jnp.sqrt(mu * (1 + e) / (1 - e))])
-
-
-def _make_constraint(args: KeplerArgs, y0: State) -> Invariants:
-    return Invariants(_invariants, y0=y0, args=args)
 
 
 def _exact(t: np.ndarray, args: KeplerArgs, y0: Any) -> tuple[np.ndarray, np.ndarray]:
@@ -115,6 +108,6 @@ def kepler(*, mu: Any = 1.0, eccentricity: Any = 0.6, t1: float = 6 * math.pi) -
         t1=t1,
         args=KeplerArgs(mu, eccentricity),
         initial_state=_initial_state,
-        make_constraint=_make_constraint,
+        invariants=_invariants,
         exact=_exact,
     )

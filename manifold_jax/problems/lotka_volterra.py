@@ -8,7 +8,6 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._base.types import FloatScalar, RealScalarLike
-from .._constraint.constraint import Invariants
 from ._problem import Problem, require_standard
 
 
@@ -30,15 +29,11 @@ END = (1.02634476757508932, 0.909691078136041618)
 # same way.
 COST_BY_START = (0.299599508303682302, -0.0141518163448535055)
 COST_BY_RATES = (
-    0.621961585551280884,
-    0.0680014041508743366,
-    0.169176463995892817,
-    0.272560693950007505,
-)
+    0.621961585551280884, 0.0680014041508743366, 0.169176463995892817, 0.272560693950007505,
+)  # fmt: skip
 
 
 def _field(t: RealScalarLike, y: Float[Array, "2"], args: LotkaVolterraArgs) -> Float[Array, "2"]:
-    del t
     p0, p1, p2, p3 = args
     prey, predator = y[0], y[1]
     meetings = prey * predator
@@ -46,7 +41,6 @@ def _field(t: RealScalarLike, y: Float[Array, "2"], args: LotkaVolterraArgs) -> 
 
 
 def _invariant(t: RealScalarLike, y: Float[Array, "2"], args: LotkaVolterraArgs) -> FloatScalar:
-    del t
     p0, p1, p2, p3 = args
     prey, predator = y[0], y[1]
     return p3 * prey - p2 * jnp.log(prey) + p1 * predator - p0 * jnp.log(predator)
@@ -54,10 +48,6 @@ def _invariant(t: RealScalarLike, y: Float[Array, "2"], args: LotkaVolterraArgs)
 
 def _initial_state(args: LotkaVolterraArgs, start: Float[Array, "2"] | None) -> Float[Array, "2"]:
     return jnp.ones(2, jnp.result_type(*args)) if start is None else start
-
-
-def _make_constraint(args: LotkaVolterraArgs, y0: Float[Array, "2"]) -> Invariants:
-    return Invariants(_invariant, y0=y0, args=args)
 
 
 def _exact(t: np.ndarray, args: LotkaVolterraArgs, y0: np.ndarray) -> np.ndarray:
@@ -100,7 +90,7 @@ def lotka_volterra(
         t1=10.0,
         args=LotkaVolterraArgs(prey_birth, prey_loss, predator_death, predator_gain),
         initial_state=_initial_state,
-        make_constraint=_make_constraint,
+        invariants=_invariant,
         exact=_exact,
-        at_end_only=True,
+        reference_at_end_only=True,
     )

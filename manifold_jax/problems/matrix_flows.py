@@ -4,7 +4,7 @@ All data come from fixed formulas, no random numbers: every implementation can u
 same ones.
 """
 
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import diffrax
 import jax.numpy as jnp
@@ -17,7 +17,8 @@ from .._lie_groups import LieGroupChart, SO3
 from ._problem import as_floating, Problem
 
 
-# sphere_flow
+Vector: TypeAlias = Float[Array, " n"]
+Matrix: TypeAlias = Float[Array, "3 3"]
 
 
 class SphereFlowArgs(NamedTuple):
@@ -26,32 +27,21 @@ class SphereFlowArgs(NamedTuple):
     matrix: Any
 
 
-def _sphere_field(
-    t: RealScalarLike, y: Float[Array, " n"], args: SphereFlowArgs
-) -> Float[Array, " n"]:
-    del t
+def _sphere_field(t: RealScalarLike, y: Vector, args: SphereFlowArgs) -> Vector:
     image = args.matrix @ y
     return image - jnp.sum(y * image) * y
 
 
-def _sphere_residual(t: RealScalarLike, y: Float[Array, " n"], args: SphereFlowArgs) -> FloatScalar:
-    del t, args
+def _sphere_residual(t: RealScalarLike, y: Vector, args: SphereFlowArgs) -> FloatScalar:
     return jnp.sum(y * y) - 1
 
 
-def _sphere_initial_state(
-    args: SphereFlowArgs, start: Float[Array, " n"] | None
-) -> Float[Array, " n"]:
+def _sphere_initial_state(args: SphereFlowArgs, start: Vector | None) -> Vector:
     if start is not None:
         return start
     n, dtype = args.matrix.shape[0], args.matrix.dtype
     x = np.sin(np.arange(1.0, n + 1) ** 2)
     return jnp.asarray(x / np.linalg.norm(x), dtype)
-
-
-def _sphere_constraint(args: SphereFlowArgs, y0: Float[Array, " n"]) -> Constraint:
-    del args, y0
-    return Constraint(_sphere_residual)
 
 
 def _sphere_exact(t: np.ndarray, args: SphereFlowArgs, y0: np.ndarray) -> np.ndarray:
@@ -91,15 +81,12 @@ def sphere_flow(*, n: int = 10, t1: float = 2.0) -> Problem:
     return Problem(
         "sphere-flow",
         diffrax.ODETerm(_sphere_field),
+        constraint=Constraint(_sphere_residual),
         t1=t1,
         args=SphereFlowArgs(as_floating((entries + entries.T) / 2)),
         initial_state=_sphere_initial_state,
-        make_constraint=_sphere_constraint,
         exact=_sphere_exact,
     )
-
-
-# rotation
 
 
 class RotationArgs(NamedTuple):
@@ -108,32 +95,19 @@ class RotationArgs(NamedTuple):
     omega: Any
 
 
-def _rotation_field(
-    t: RealScalarLike, y: Float[Array, "3 3"], args: RotationArgs
-) -> Float[Array, "3 3"]:
-    del t
+def _rotation_field(t: RealScalarLike, y: Matrix, args: RotationArgs) -> Matrix:
     # row by row: r^T hat(omega) = (r x omega)^T
     return jnp.cross(y, args.omega[None, :])
 
 
-def _rotation_residual(
-    t: RealScalarLike, y: Float[Array, "3 3"], args: RotationArgs
-) -> Float[Array, "6"]:
-    del t, args
+def _rotation_residual(t: RealScalarLike, y: Matrix, args: RotationArgs) -> Float[Array, "6"]:
     # the upper triangle: the whole symmetric matrix would be 9 dependent equations
     products = [jnp.sum(y[:, i] * y[:, j]) - float(i == j) for i in range(3) for j in range(i, 3)]
     return jnp.stack(products)
 
 
-def _rotation_initial_state(
-    args: RotationArgs, start: Float[Array, "3 3"] | None
-) -> Float[Array, "3 3"]:
+def _rotation_initial_state(args: RotationArgs, start: Matrix | None) -> Matrix:
     return jnp.eye(3, dtype=args.omega.dtype) if start is None else start
-
-
-def _rotation_constraint(args: RotationArgs, y0: Float[Array, "3 3"]) -> Constraint:
-    del args, y0
-    return Constraint(_rotation_residual)
 
 
 def _rotation_exact(t: np.ndarray, args: RotationArgs, y0: np.ndarray) -> np.ndarray:
@@ -167,10 +141,10 @@ def rotation(*, omega: Any = (1.0, -2.0, 0.5), t1: float = 10.0) -> Problem:
     return Problem(
         "rotation",
         diffrax.ODETerm(_rotation_field),
+        constraint=Constraint(_rotation_residual),
         chart=LieGroupChart(SO3()),
         t1=t1,
         args=RotationArgs(as_floating(omega)),
         initial_state=_rotation_initial_state,
-        make_constraint=_rotation_constraint,
         exact=_rotation_exact,
     )

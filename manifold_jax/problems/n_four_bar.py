@@ -32,7 +32,6 @@ def _mass(q: Bodies, args: NFourBarArgs) -> Bodies:
 def _joints(t: RealScalarLike, q: Bodies, args: NFourBarArgs) -> Any:
     """Return the gaps of the joints of the crank with the ground, with the coupler before it and
     with that after it."""
-    del t
     half = 0.5 * args.length * jnp.stack([jnp.cos(q[:, 2]), jnp.sin(q[:, 2])], axis=1)
     start, end = q[:, :2] - half, q[:, :2] + half
     pivots = jnp.arange(start[::2].shape[0], dtype=q.dtype) * args.length
@@ -41,7 +40,6 @@ def _joints(t: RealScalarLike, q: Bodies, args: NFourBarArgs) -> Any:
 
 
 def _force(t: RealScalarLike, q: Bodies, v: Bodies, args: NFourBarArgs) -> Bodies:
-    del t, v
     weight = jnp.stack([jnp.zeros_like(args.mass), -args.mass * args.gravity, 0 * args.mass])
     return jnp.broadcast_to(weight, q.shape)
 
@@ -55,16 +53,10 @@ def _initial_state(args: NFourBarArgs, start: State) -> State:
 def _bodies(xp: Any, angle: Any, rate: Any, length: Any, loops: int) -> tuple[Any, Any]:
     """Cranks and couplers in turn, all cranks at the same angle: the last two axes."""
     c, s, zero = xp.cos(angle), xp.sin(angle), 0 * angle
-    crank = xp.stack([0.5 * length * c, 0.5 * length * s, angle], axis=-1)
-    coupler = xp.stack([length * (c + 0.5), length * s, zero], axis=-1)
-    one = xp.stack([crank, coupler], axis=-2)
-    v = rate[..., None, None] * xp.stack(
-        [
-            xp.stack([-0.5 * length * s, 0.5 * length * c, zero + 1], axis=-1),
-            xp.stack([-length * s, length * c, zero], axis=-1),
-        ],
-        axis=-2,
-    )
+    rows = lambda *parts: xp.stack([xp.stack(part, axis=-1) for part in parts], axis=-2)
+    one = rows((0.5 * length * c, 0.5 * length * s, angle), (length * (c + 0.5), length * s, zero))
+    v = rows((-0.5 * length * s, 0.5 * length * c, zero + 1), (-length * s, length * c, zero))
+    v = rate[..., None, None] * v
     body = np.arange(2 * loops + 1)
     shift = length * xp.asarray(body // 2, length.dtype)
     shift = xp.stack([shift, 0 * shift, 0 * shift], axis=-1)

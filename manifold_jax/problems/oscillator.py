@@ -20,12 +20,10 @@ class OscillatorArgs(NamedTuple):
 
 
 def _field(t: RealScalarLike, y: Float[Array, "2"], args: OscillatorArgs) -> Float[Array, "2"]:
-    del t, args
     return jnp.stack([y[1], -y[0]])
 
 
 def _residual(t: RealScalarLike, y: Float[Array, "2"], args: OscillatorArgs) -> Float[Array, ""]:
-    del t
     return jnp.sum(y * y) - args.radius**2
 
 
@@ -35,13 +33,7 @@ def _initial_state(args: OscillatorArgs, start: Float[Array, "2"] | None) -> Flo
     return jnp.stack([args.radius, jnp.zeros_like(args.radius)])
 
 
-def _make_constraint(args: OscillatorArgs, y0: Float[Array, "2"]) -> Constraint:
-    del args, y0
-    return Constraint(_residual)
-
-
 def _exact(t: np.ndarray, args: OscillatorArgs, y0: np.ndarray) -> np.ndarray:
-    del args
     c, s = np.cos(t), np.sin(t)
     return np.stack([y0[0] * c + y0[1] * s, y0[1] * c - y0[0] * s], axis=-1)
 
@@ -72,9 +64,9 @@ def harmonic_oscillator(*, radius: Any = 1.0, t1: float = 2 * math.pi) -> Proble
     return Problem(
         "harmonic-oscillator",
         diffrax.ODETerm(_field),
+        constraint=Constraint(_residual),
         t1=t1,
         args=OscillatorArgs(radius),
         initial_state=_initial_state,
-        make_constraint=_make_constraint,
         exact=_exact,
     )

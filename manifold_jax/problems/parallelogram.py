@@ -1,5 +1,6 @@
 """A parallelogram linkage with one crank too many."""
 
+from types import ModuleType
 from typing import Any, NamedTuple, TypeAlias
 
 import jax.numpy as jnp
@@ -29,7 +30,6 @@ class ParallelogramArgs(NamedTuple):
 
 
 def _mass(q: Vector, args: ParallelogramArgs) -> Vector:
-    del q
     crank = args.crank_mass * args.length**2 / 3
     coupler = [args.coupler_mass, args.coupler_mass, args.coupler_inertia]
     return jnp.stack([*coupler, crank, crank, crank])
@@ -37,7 +37,6 @@ def _mass(q: Vector, args: ParallelogramArgs) -> Vector:
 
 def _joints(t: RealScalarLike, q: Vector, args: ParallelogramArgs) -> Float[Array, "2 3"]:
     """The pins of the coupler less the ends of the cranks."""
-    del t
     pins = args.spacing * jnp.asarray([-1.0, 0.0, 1.0], q.dtype)
     x = q[0] + pins * jnp.cos(q[2]) - pins - args.length * jnp.sin(q[3:])
     y = q[1] + pins * jnp.sin(q[2]) + args.length * jnp.cos(q[3:])
@@ -45,7 +44,6 @@ def _joints(t: RealScalarLike, q: Vector, args: ParallelogramArgs) -> Float[Arra
 
 
 def _force(t: RealScalarLike, q: Vector, v: Vector, args: ParallelogramArgs) -> Vector:
-    del t, v
     zero = jnp.zeros_like(args.gravity)
     coupler = jnp.stack([zero, -args.coupler_mass * args.gravity, zero])
     torques = -0.5 * args.crank_mass * args.gravity * args.length * jnp.sin(q[3:])
@@ -55,11 +53,14 @@ def _force(t: RealScalarLike, q: Vector, v: Vector, args: ParallelogramArgs) -> 
 def _initial_state(args: ParallelogramArgs, start: State) -> State:
     """The angles and rates of the cranks, with the length of `args`."""
     (_, _, tilt, *cranks), (_, _, _, rate, *_) = start
-    angle = cranks[0]
-    position = [args.length * jnp.sin(angle), -args.length * jnp.cos(angle)]
-    velocity = [-position[1] * rate, position[0] * rate]
-    v = [*velocity, jnp.zeros_like(rate), rate, rate, rate]
-    return jnp.stack([*position, tilt, *cranks]), jnp.stack(v)
+    return _links(jnp, tilt, cranks, rate, args.length)
+
+
+def _links(xp: ModuleType, tilt: Any, cranks: list, rate: Any, length: Any) -> tuple[Any, Any]:
+    """The state of cranks that turn at one rate, in NumPy or JAX."""
+    x, y, still = length * xp.sin(cranks[0]), -length * xp.cos(cranks[0]), 0 * rate
+    q, v = [x, y, tilt + still, *cranks], [-y * rate, x * rate, still, rate, rate, rate]
+    return xp.stack(q, axis=-1), xp.stack(v, axis=-1)
 
 
 def _exact(t: np.ndarray, args: ParallelogramArgs, y0: Any) -> tuple[np.ndarray, np.ndarray]:
@@ -76,11 +77,7 @@ def _exact(t: np.ndarray, args: ParallelogramArgs, y0: Any) -> tuple[np.ndarray,
         )
     sin_half, cos_half, rate = swing(t, frequency, start, rate)
     angle = 2 * np.arctan2(sin_half, cos_half)
-    still = np.zeros_like(t)
-    x, y = L * np.sin(angle), -L * np.cos(angle)
-    angles = [angle + (crank - start) for crank in cranks]
-    q, v = [x, y, tilt + still, *angles], [-y * rate, x * rate, still, rate, rate, rate]
-    return np.stack(q, axis=-1), np.stack(v, axis=-1)
+    return _links(np, tilt, [angle + (crank - start) for crank in cranks], rate, L)
 
 
 def parallelogram(
@@ -126,6 +123,7 @@ def parallelogram(
     Source: the mechanism is classical; redundant constraints as in Garcia de Jalon & Bayo,
     Kinematic and Dynamic Simulation of Multibody Systems (1994).
     """
+    args = ParallelogramArgs(coupler_mass, coupler_inertia, crank_mass, length, spacing, gravity)
     angle, rate = as_floating(angle), as_floating(rate)
     zero = jnp.zeros_like(angle)
     start = jnp.stack([zero] * 3 + [angle] * 3), jnp.stack([zero] * 3 + [rate] * 3)
@@ -133,14 +131,7 @@ def parallelogram(
         "parallelogram",
         system=MechanicalSystem(_mass, _joints, _force, redundant=True),
         t1=t1,
-        args=ParallelogramArgs(
-            coupler_mass,
-            coupler_inertia,
-            crank_mass,
-            length,
-            spacing,
-            gravity,
-        ),
+        args=args,
         start=start,
         initial_state=_initial_state,
         exact=_exact,

@@ -1,6 +1,5 @@
 """A polymer in space: beads on rigid bonds, as in molecular dynamics."""
 
-from collections.abc import Callable
 from typing import Any, NamedTuple, TypeAlias
 
 import jax.numpy as jnp
@@ -9,8 +8,8 @@ from jaxtyping import Array, Float
 
 from .._base.types import RealScalarLike
 from .._mechanics import MechanicalSystem
-from ._problem import as_floating, Problem
-from ._rods import allowed, Rods, solve_rods
+from ._problem import as_floating, Problem, repeated
+from ._rods import allowed, Force, Rods, solve_rods
 
 
 Beads: TypeAlias = Float[Array, "beads 3"]
@@ -31,14 +30,12 @@ def _mass(q: Beads, args: PolymerArgs) -> Beads:
 
 
 def _bonds(t: RealScalarLike, q: Beads, args: PolymerArgs) -> Float[Array, " bonds"]:
-    del t
     # Not as a sum over an axis, which XLA would give to a library.
     x, y, z = jnp.diff(q, axis=0).T
     return 0.5 * (x * x + y * y + z * z - args.lengths**2)
 
 
 def _force(t: RealScalarLike, q: Beads, v: Beads, args: PolymerArgs) -> Beads:
-    del t, v
     return _bending(jnp, q, args)
 
 
@@ -77,7 +74,7 @@ def rods(args: PolymerArgs) -> Rods:
     return Rods.between(bead, bead + 1, 1 / args.masses)
 
 
-def force(args: PolymerArgs) -> Callable[[np.ndarray], np.ndarray]:
+def force(args: PolymerArgs) -> Force:
     """Return the force, in NumPy."""
     args = PolymerArgs(*(np.asarray(part) for part in args))
     return lambda q: _bending(np, q, args)
@@ -122,10 +119,8 @@ def polymer(
     Ryckaert, Ciccotti & Berendsen, J. Comput. Phys. 23 (1977) 327-341 (SHAKE); Andersen, J. Comput.
     Phys. 52 (1983) 24-34 (RATTLE).
     """
-    per = lambda value, number, what: _per(as_floating(value), number, what)
-    args = PolymerArgs(
-        per(masses, bonds + 1, "masses"), per(lengths, bonds, "lengths"), as_floating(stiffness)
-    )
+    masses, lengths = repeated(masses, bonds + 1, "masses"), repeated(lengths, bonds, "lengths")
+    args = PolymerArgs(masses, lengths, as_floating(stiffness))
     start = _thermal(args, temperature, np.random.default_rng(seed))
     return Problem(
         "polymer",
@@ -138,12 +133,6 @@ def polymer(
     )
 
 
-def _per(value: Array, number: int, what: str) -> Array:
-    if value.shape not in ((), (number,)):
-        raise ValueError(f"`{what}` must be a scalar or of shape ({number},), got {value.shape}.")
-    return jnp.broadcast_to(value, (number,))
-
-
 def _thermal(
     args: PolymerArgs, temperature: float, random: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -154,7 +143,7 @@ def _thermal(
     uniform = random.uniform(size=bonds)
     cosine = 1 + np.log(uniform + (1 - uniform) * np.exp(-2 * stretch)) / stretch
     along = np.empty((bonds, 3))
-    along[0] = np.array([1.0, 0.0, 0.0])
+    along[0] = 1.0, 0.0, 0.0
     for i in range(1, bonds):
         across = random.normal(size=3)
         across -= across @ along[i - 1] * along[i - 1]

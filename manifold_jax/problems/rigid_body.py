@@ -10,7 +10,6 @@ import scipy.special
 from jaxtyping import Array, Float
 
 from .._base.types import RealScalarLike
-from .._constraint.constraint import Invariants
 from ._problem import as_floating, Problem
 
 
@@ -24,29 +23,13 @@ class RigidBodyArgs(NamedTuple):
 
 
 def _field(t: RealScalarLike, y: Float[Array, "3"], args: RigidBodyArgs) -> Float[Array, "3"]:
-    del t
     w = y / args.inertia
-    return jnp.stack(
-        [
-            y[1] * w[2] - y[2] * w[1],
-            y[2] * w[0] - y[0] * w[2],
-            y[0] * w[1] - y[1] * w[0],
-        ]
-    )
+    cyclic = [(1, 2), (2, 0), (0, 1)]
+    return jnp.stack([y[i] * w[j] - y[j] * w[i] for i, j in cyclic])
 
 
 def _invariants(t: RealScalarLike, y: Float[Array, "3"], args: RigidBodyArgs) -> Float[Array, "2"]:
-    del t
     return jnp.stack([jnp.sum(y * y), 0.5 * jnp.sum(y * y / args.inertia)])
-
-
-def _initial_state(args: RigidBodyArgs, start: Float[Array, "3"]) -> Float[Array, "3"]:
-    del args
-    return start
-
-
-def _make_constraint(args: RigidBodyArgs, y0: Float[Array, "3"]) -> Invariants:
-    return Invariants(_invariants, y0=y0, args=args)
 
 
 def _exact(t: np.ndarray, args: RigidBodyArgs, y0: np.ndarray) -> np.ndarray:
@@ -88,10 +71,7 @@ def _exact(t: np.ndarray, args: RigidBodyArgs, y0: np.ndarray) -> np.ndarray:
 
 
 def rigid_body(
-    *,
-    inertia: Any = (2.0, 1.0, 2 / 3),
-    y0: Any = STANDARD_START,
-    t1: float = 30.0,
+    *, inertia: Any = (2.0, 1.0, 2 / 3), y0: Any = STANDARD_START, t1: float = 30.0
 ) -> Problem:
     r"""Euler's equations of the free rigid body.
 
@@ -121,7 +101,6 @@ def rigid_body(
         t1=t1,
         args=RigidBodyArgs(as_floating(inertia)),
         start=as_floating(y0),
-        initial_state=_initial_state,
-        make_constraint=_make_constraint,
+        invariants=_invariants,
         exact=_exact,
     )

@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 
 from .._base.types import RealScalarLike
 from .._mechanics import MechanicalSystem
-from ._problem import Problem
+from ._problem import as_floating, Problem
 
 
 Vector: TypeAlias = Float[Array, "4"]
@@ -28,26 +28,21 @@ class RollingDiscArgs(NamedTuple):
 
 
 def _mass(q: Vector, args: RollingDiscArgs) -> Vector:
-    del q
     return jnp.stack([args.mass, args.mass, args.steering_inertia, args.rolling_inertia])
 
 
 def _no_slip(t: RealScalarLike, q: Vector, v: Vector, args: RollingDiscArgs) -> Float[Array, "2"]:
-    del t
     speed = args.radius * v[3]
     return jnp.stack([v[0] - speed * jnp.cos(q[2]), v[1] - speed * jnp.sin(q[2])])
 
 
 def _force(t: RealScalarLike, q: Vector, v: Vector, args: RollingDiscArgs) -> Vector:
-    del t, v
     downhill = args.mass * args.gravity * jnp.sin(args.slope)
     return jnp.zeros_like(q).at[0].set(downhill)
 
 
-def _initial_state(args: RollingDiscArgs, start: State | None) -> State:
-    """Return the state at the origin, or the position and the two angular velocities of `start`."""
-    if start is None:
-        start = (jnp.asarray([0.0, 0.0, 0.4, 0.0]), jnp.asarray([0.0, 0.0, 1.5, 2.0]))
+def _initial_state(args: RollingDiscArgs, start: State) -> State:
+    """The position and the two angular velocities of `start`, rolling without slipping."""
     q, v = start
     speed = args.radius * v[3]
     return q, jnp.stack([speed * jnp.cos(q[2]), speed * jnp.sin(q[2]), v[2], v[3]])
@@ -129,6 +124,7 @@ def rolling_disc(
         system=MechanicalSystem(_mass, None, _force, velocity_constraint=_no_slip),
         t1=t1,
         args=RollingDiscArgs(mass, radius, rolling_inertia, steering_inertia, gravity, slope),
+        start=(as_floating([0.0, 0.0, 0.4, 0.0]), as_floating([0.0, 0.0, 1.5, 2.0])),
         initial_state=_initial_state,
         exact=_exact,
     )

@@ -1,6 +1,7 @@
 """A slider-crank with a spring and a damper."""
 
 import math
+from types import ModuleType
 from typing import Any, NamedTuple, TypeAlias
 
 import jax.numpy as jnp
@@ -38,31 +39,25 @@ class SliderCrankArgs(NamedTuple):
 
 
 def _mass(q: Vector, args: SliderCrankArgs) -> Vector:
-    del q
     return jnp.stack([args.crank_inertia, args.slider_mass, args.rod_inertia])
 
 
 def _linkage(t: RealScalarLike, q: Vector, args: SliderCrankArgs) -> Float[Array, "2"]:
-    del t
     crank, x, rod = q[0], q[1], q[2]
     a = args.crank_length
     return jnp.stack([x - jnp.cos(rod) - a * jnp.cos(crank), -jnp.sin(rod) - a * jnp.sin(crank)])
 
 
 def _force(t: RealScalarLike, q: Vector, v: Vector, args: SliderCrankArgs) -> Vector:
-    del t
     crank, x, rod = q[0], q[1], q[2]
     half = 0.5 * args.crank_length
     # from the middle of the crank to the middle of the rod
     dx = x - 0.5 * jnp.cos(rod) - half * jnp.cos(crank)
     dy = -0.5 * jnp.sin(rod) - half * jnp.sin(crank)
     length = jnp.sqrt(dx**2 + dy**2)
-    stretching = [
-        half * (dx * jnp.sin(crank) - dy * jnp.cos(crank)),
-        dx,
-        0.5 * (dx * jnp.sin(rod) - dy * jnp.cos(rod)),
-    ]
-    direction = jnp.stack(stretching) / length  # d length / dq
+    of_crank = half * (dx * jnp.sin(crank) - dy * jnp.cos(crank))
+    of_rod = 0.5 * (dx * jnp.sin(rod) - dy * jnp.cos(rod))
+    direction = jnp.stack([of_crank, dx, of_rod]) / length  # d length / dq
     tension = args.stiffness * (length - args.spring_length)
     tension = tension + args.damping * jnp.sum(direction * v)
     push = jnp.stack([jnp.zeros_like(args.push), args.push, -args.push * jnp.sin(rod)])
@@ -78,23 +73,18 @@ def _initial_state(args: SliderCrankArgs, start: State | None) -> State:
     else:
         crank, rate, rod = start[0][0], start[1][0], start[0][2]
     side = jnp.sign(jnp.cos(rod))
-    sin_rod = -a * jnp.sin(crank)
-    cos_rod = side * jnp.sqrt(1 - sin_rod**2)
-    principal = side * jnp.arcsin(sin_rod) + (1 - side) * math.pi / 2
+    x, principal, x1, rod1, _, _ = _configuration(jnp, crank, a, side)
     rod = principal + 2 * math.pi * jnp.round((rod - principal) / (2 * math.pi))
-    rod_rate = -a * jnp.cos(crank) * rate / cos_rod
-    x_rate = -a * jnp.sin(crank) * rate - sin_rod * rod_rate
-    q = [crank, a * jnp.cos(crank) + cos_rod, rod]
-    return jnp.stack(q), jnp.stack([rate, x_rate, rod_rate])
+    return jnp.stack([crank, x, rod]), jnp.stack([rate, x1 * rate, rod1 * rate])
 
 
-def _configuration(crank: Any, a: float, side: float) -> tuple[Any, ...]:
-    """Slider and rod for a crank angle, then their first and second derivatives by it;
-    `side` is the sign of the cosine of the rod's angle."""
-    s, c = np.sin(crank), np.cos(crank)
+def _configuration(xp: ModuleType, crank: Any, a: Any, side: Any) -> tuple[Any, ...]:
+    """Slider and rod for a crank angle, then their first and second derivatives by it, in NumPy or
+    JAX; `side` is the sign of the cosine of the rod's angle."""
+    s, c = xp.sin(crank), xp.cos(crank)
     sin_rod = -a * s
-    cos_rod = side * np.sqrt(1 - sin_rod**2)
-    rod = side * np.arcsin(sin_rod) + (1 - side) * np.pi / 2
+    cos_rod = side * xp.sqrt(1 - sin_rod**2)
+    rod = side * xp.arcsin(sin_rod) + (1 - side) * math.pi / 2
     rod1 = -a * c / cos_rod
     rod2 = (a * s + sin_rod * rod1**2) / cos_rod
     x1 = -a * s - sin_rod * rod1
@@ -110,11 +100,11 @@ def _exact(t: np.ndarray, args: SliderCrankArgs, y0: Any) -> tuple[np.ndarray, n
     k, c, l0, push, a, *masses = (float(p) for p in args)
     (crank0, _, rod0), (rate0, _, _) = y0
     side = np.sign(np.cos(rod0))
-    turns = np.round((rod0 - _configuration(crank0, a, side)[1]) / (2 * np.pi))
+    turns = np.round((rod0 - _configuration(np, crank0, a, side)[1]) / (2 * np.pi))
 
     def field(t, state):
         crank, rate = state
-        x, rod, x1, rod1, x2, rod2 = _configuration(crank, a, side)
+        x, rod, x1, rod1, x2, rod2 = _configuration(np, crank, a, side)
         # the spring, and its rate of change along the motion
         dx = x - 0.5 * np.cos(rod) - 0.5 * a * np.cos(crank)
         dx1 = x1 + 0.5 * np.sin(rod) * rod1 + 0.5 * a * np.sin(crank)
@@ -129,7 +119,7 @@ def _exact(t: np.ndarray, args: SliderCrankArgs, y0: Any) -> tuple[np.ndarray, n
         return rate, (force - bias) / inertia
 
     crank, rate = integrate(field, (crank0, rate0), t).T
-    x, rod, x1, rod1, _, _ = _configuration(crank, a, side)
+    x, rod, x1, rod1, _, _ = _configuration(np, crank, a, side)
     q = np.stack([crank, x, rod + 2 * np.pi * turns], axis=-1)
     return q, np.stack([rate, x1 * rate, rod1 * rate], axis=-1)
 
@@ -178,20 +168,21 @@ def slider_crank(
 
     Source: SUNDIALS (Hindmarsh et al.), examples idasSlCrank.
     """
+    args = SliderCrankArgs(
+        stiffness,
+        damping,
+        spring_length,
+        push,
+        crank_length,
+        crank_inertia,
+        slider_mass,
+        rod_inertia,
+    )
     return Problem(
         "slider-crank",
         system=MechanicalSystem(_mass, _linkage, _force),
         t1=t1,
-        args=SliderCrankArgs(
-            stiffness,
-            damping,
-            spring_length,
-            push,
-            crank_length,
-            crank_inertia,
-            slider_mass,
-            rod_inertia,
-        ),
+        args=args,
         initial_state=_initial_state,
         exact=_exact,
     )

@@ -13,40 +13,27 @@ from jaxtyping import Array, Float
 
 from .._base.types import FloatScalar, RealScalarLike
 from .._constraint.constraint import Constraint
-from ._problem import Problem
+from ._problem import as_floating, Problem
 
 
-State: TypeAlias = tuple[Float[Array, "2"], Float[Array, "2"]]
+Vector: TypeAlias = Float[Array, "2"]
+State: TypeAlias = tuple[Vector, Vector]
+
+AREVALO_T0 = 1.0
 
 
-# jay2
-
-
-def _jay2_field(t: RealScalarLike, y: Float[Array, "2"], args: None) -> Float[Array, "2"]:
-    del t, args
+def _jay2_field(t: RealScalarLike, y: Vector, args: None) -> Vector:
     y1, y2 = y[0], y[1]
     # the root of 2 y2 z^2 - 3 z + y1^2 = 0 that is 1 / y2 on the manifold
     z = (3 + jnp.sqrt(9 - 8 * y2 * y1**2)) / (4 * y2)
     return jnp.stack([y1 * y2**2 * z**2, y1**2 * y2**2 - 3 * y2**2 * z])
 
 
-def _jay2_residual(t: RealScalarLike, y: Float[Array, "2"], args: None) -> FloatScalar:
-    del t, args
+def _jay2_residual(t: RealScalarLike, y: Vector, args: None) -> FloatScalar:
     return y[0] ** 2 * y[1] - 1
 
 
-def _jay2_initial_state(args: None, start: Float[Array, "2"] | None) -> Float[Array, "2"]:
-    del args
-    return jnp.ones(2) if start is None else start
-
-
-def _jay2_constraint(args: None, y0: Float[Array, "2"]) -> Constraint:
-    del args, y0
-    return Constraint(_jay2_residual)
-
-
 def _jay2_exact(t: np.ndarray, args: None, y0: np.ndarray) -> np.ndarray:
-    del args
     return np.stack([y0[0] * np.exp(t), y0[1] * np.exp(-2 * t)], axis=-1)
 
 
@@ -72,20 +59,14 @@ def jay2() -> Problem:
     return Problem(
         "jay2",
         diffrax.ODETerm(_jay2_field),
+        constraint=Constraint(_jay2_residual),
         t1=1.0,
-        initial_state=_jay2_initial_state,
-        make_constraint=_jay2_constraint,
+        start=jnp.ones(2),
         exact=_jay2_exact,
     )
 
 
-# arevalo
-
-AREVALO_T0 = 1.0
-
-
 def _arevalo_field(t: RealScalarLike, y: State, args: None) -> State:
-    del t, args
     q, v = y
     # the force is perpendicular to q, so that the multiplier is centripetal only
     multiplier = jnp.sum(v * v) / jnp.sum(q * q)
@@ -93,28 +74,12 @@ def _arevalo_field(t: RealScalarLike, y: State, args: None) -> State:
 
 
 def _arevalo_residual(t: RealScalarLike, y: State, args: None) -> tuple[FloatScalar, FloatScalar]:
-    del t, args
     q, v = y
     return jnp.sum(q * q) - 1, jnp.sum(q * v)
 
 
-def _arevalo_initial_state(args: None, start: State | None) -> State:
-    del args
-    if start is not None:
-        return start
-    s, c = math.sin(AREVALO_T0**2), math.cos(AREVALO_T0**2)
-    q, v = (s, c), (2 * AREVALO_T0 * c, -2 * AREVALO_T0 * s)
-    return jnp.asarray(q, float), jnp.asarray(v, float)
-
-
-def _arevalo_constraint(args: None, y0: State) -> Constraint:
-    del args, y0
-    return Constraint(_arevalo_residual)
-
-
 def _arevalo_exact(t: np.ndarray, args: None, y0: Any) -> tuple[np.ndarray, np.ndarray]:
     """Return the exact solution. With `q = (sin p, cos p)` the motion is `p'' = 2`."""
-    del args
     (x, y), (vx, vy) = y0
     elapsed = t - AREVALO_T0
     start, rate = np.arctan2(x, y), vx * y - vy * x
@@ -135,18 +100,17 @@ def arevalo() -> Problem:
     Source: C. Arevalo & P. Lotstedt, Improving the accuracy of BDF methods for index 3
     differential-algebraic equations, BIT 35 (1995) 297-308.
     """
+    s, c = math.sin(AREVALO_T0**2), math.cos(AREVALO_T0**2)
+    q, v = (s, c), (2 * AREVALO_T0 * c, -2 * AREVALO_T0 * s)
     return Problem(
         "arevalo",
         diffrax.ODETerm(_arevalo_field),
+        constraint=Constraint(_arevalo_residual),
         t0=AREVALO_T0,
         t1=5.0,
-        initial_state=_arevalo_initial_state,
-        make_constraint=_arevalo_constraint,
+        start=(as_floating(q), as_floating(v)),
         exact=_arevalo_exact,
     )
-
-
-# skate
 
 
 class SkateArgs(NamedTuple):
@@ -165,7 +129,6 @@ def _skate_field(t: RealScalarLike, y: State, args: SkateArgs) -> State:
 
 
 def _skate_residual(t: RealScalarLike, y: State, args: SkateArgs) -> FloatScalar:
-    del args
     _, v = y
     return v[1] * jnp.cos(t) - v[0] * jnp.sin(t)
 
@@ -174,11 +137,6 @@ def _skate_initial_state(args: SkateArgs, start: State | None) -> State:
     if start is not None:
         return start
     return jnp.zeros(2, jnp.result_type(args.slope)), jnp.zeros(2, jnp.result_type(args.slope))
-
-
-def _skate_constraint(args: SkateArgs, y0: State) -> Constraint:
-    del args, y0
-    return Constraint(_skate_residual)
 
 
 def _skate_exact(t: np.ndarray, args: SkateArgs, y0: Any) -> tuple[np.ndarray, np.ndarray]:
@@ -216,9 +174,9 @@ def skate(*, slope: Any = 0.8) -> Problem:
     return Problem(
         "skate",
         diffrax.ODETerm(_skate_field),
+        constraint=Constraint(_skate_residual),
         t1=10.0,
         args=SkateArgs(slope),
         initial_state=_skate_initial_state,
-        make_constraint=_skate_constraint,
         exact=_skate_exact,
     )

@@ -4,6 +4,7 @@ import math
 from typing import Any, NamedTuple, TypeAlias
 
 import jax.numpy as jnp
+import jax.tree_util as jtu
 import numpy as np
 
 from .._multibody import Assembly, Body, GROUND, JointSpring, Pose, Prismatic, Spherical, Universal
@@ -62,15 +63,21 @@ def _legs(xp: Any, base: Any, ends: Any, first_axes: Any) -> tuple[Any, Any]:
     return length, xp.stack([second, xp.cross(n, second), n], axis=-1)
 
 
-def _leg_rates(xp: Any, frames: Any, length: Any, first_axes: Any, moving: Any) -> tuple[Any, Any]:
-    """Rates of the directions, and angular velocities, of velocities of the upper ends `(6, 3)`.
+def _leg_motion(xp: Any, points: tuple, x: Any, R: Any, u: Any, w: Any) -> tuple[Any, ...]:
+    """Of position, rotation and twists `(..., 3)` of the platform: the upper ends of the legs and
+    their velocities, the frames of the legs, rates of the directions, and angular velocities.
     The universal joint decides about the spin: its second axis stays perpendicular to its first."""
+    base, local, first_axes = points
+    arms = local @ R.T
+    ends = arms + x[None, :]
+    moving = u[..., None, :] + xp.cross(w[..., None, :], arms)
+    length, frames = _legs(xp, base, ends, first_axes)
     second, normal, n = frames[..., 0], frames[..., 1], frames[..., 2]
     dot = lambda a, b: xp.sum(a * b, axis=-1)[..., None]
     turning = (moving - n * dot(n, moving)) / length[:, None]
     sine = dot(xp.cross(first_axes, n), second)
     spin = dot(turning, xp.cross(normal, first_axes)) / sine
-    return turning, xp.cross(n, turning) + spin * n
+    return ends, moving, frames, turning, xp.cross(n, turning) + spin * n
 
 
 def assembly(args: StewartPlatformArgs) -> Assembly:
@@ -79,20 +86,17 @@ def assembly(args: StewartPlatformArgs) -> Assembly:
     zero = jnp.zeros_like(args.height)
     center = jnp.stack([zero, zero, args.height])
     ends = local + center[None, :]
-    _, frames = _legs(jnp, base, ends, first_axes)
+    length, frames = _legs(jnp, base, ends, first_axes)
     size, mass = args.platform_radius, args.leg_mass
     moments = jnp.asarray([ACROSS, ACROSS, ALONG], size.dtype) * mass * size**2
     disc = jnp.asarray([0.25, 0.25, 0.5], size.dtype) * args.platform_mass * size**2
     bodies = [Body("platform", args.platform_mass, disc, position=center)]
     joints, springs = [], []
     turned = _quaternions(jnp, frames)
-    length = jnp.sqrt(jnp.sum((ends - base) ** 2, axis=1))
     for i, (cylinder, piston) in enumerate(zip(CYLINDERS, PISTONS, strict=True)):
         second, n = frames[i, :, 0], frames[i, :, 2]
-        for name, at in (
-            (cylinder, base[i] + CENTER * size * n),
-            (piston, ends[i] - CENTER * size * n),
-        ):
+        below, above = base[i] + CENTER * size * n, ends[i] - CENTER * size * n
+        for name, at in ((cylinder, below), (piston, above)):
             bodies.append(Body(name, mass, moments, position=at, orientation=turned[i]))
         slider = f"leg {i + 1}"
         joints += [
@@ -119,6 +123,11 @@ def _spinning(xp: Any, p: Any, spin: Any) -> Any:
     return xp.concatenate([scalar, a * spin + xp.cross(spin, v)], axis=-1) / 2
 
 
+def _spin(xp: Any, p: Any, p_rate: Any) -> Any:
+    """The angular velocity in space."""
+    return 2 * (p[0] * p_rate[1:] - p_rate[0] * p[1:] + xp.cross(p[1:], p_rate[1:]))
+
+
 def _rotation(xp: Any, p: Any) -> Any:
     """Return the rotation matrix of a unit quaternion."""
     a, v = p[0], p[1:]
@@ -134,15 +143,9 @@ def _initial_state(args: StewartPlatformArgs, start: State) -> State:
 
 def _bodies(xp: Any, x: Any, p: Any, u: Any, p_rate: Any, args: Any) -> State:
     """All bodies, from the platform."""
-    base, local, first_axes = _points(xp, args)
-    R = _rotation(xp, p)
-    a, b = p[0], p[1:]
-    spin = 2 * (a * p_rate[1:] - p_rate[0] * b + xp.cross(b, p_rate[1:]))
-    arms = local @ R.T
-    ends = arms + x[None, :]
-    moving = u[None, :] + xp.cross(spin[None, :], arms)
-    length, frames = _legs(xp, base, ends, first_axes)
-    turning, spins = _leg_rates(xp, frames, length, first_axes, moving)
+    points = _points(xp, args)
+    base, R, spin = points[0], _rotation(xp, p), _spin(xp, p, p_rate)
+    ends, moving, frames, turning, spins = _leg_motion(xp, points, x, R, u, spin)
     c, n = CENTER * args.platform_radius, frames[..., 2]
     alternating = lambda lower, upper: xp.stack([lower, upper], axis=1).reshape(12, -1)
     join = lambda platform, legs: xp.concatenate([platform[None, :], legs])
@@ -159,25 +162,22 @@ def _exact(t: np.ndarray, args: StewartPlatformArgs, y0: Any) -> State:
     q, v = y0
     twist = _twist_equation(args)
     x, p, u, p_rate = q.position[0], q.orientation[0], v.position[0], v.orientation[0]
-    spin = 2 * (p[0] * p_rate[1:] - p_rate[0] * p[1:] + np.cross(p[1:], p_rate[1:]))
 
     def field(t, state):
         return np.concatenate([state[7:10], _spinning(np, state[3:7], state[10:]), twist(state)])
 
-    states = integrate(field, np.concatenate([x, p, u, spin]), t)
+    states = integrate(field, np.concatenate([x, p, u, _spin(np, p, p_rate)]), t)
     rows = []
     for state in states:
         p = state[3:7] / np.linalg.norm(state[3:7])
         p_rate = _spinning(np, p, state[10:])
         rows.append(_bodies(np, state[:3], p, state[7:10], p_rate, args))
-    stacked = lambda side, part: np.stack([getattr(row[side], part) for row in rows])
-    poses = (Pose(stacked(side, "position"), stacked(side, "orientation")) for side in (0, 1))  # pyright: ignore[reportArgumentType]
-    return tuple(poses)  # pyright: ignore[reportReturnType]
+    return jtu.tree_map(lambda *leaves: np.stack(leaves), *rows)
 
 
 def _twist_equation(args: StewartPlatformArgs) -> Any:
     """The acceleration and angular acceleration of the platform."""
-    base, local, first_axes = _points(np, args)
+    base, local, first_axes = points = _points(np, args)
     size, tiny = float(args.platform_radius), 1e-30
     masses = np.array([args.platform_mass] + [args.leg_mass] * 12)
     of_leg = float(args.leg_mass) * size**2
@@ -186,10 +186,7 @@ def _twist_equation(args: StewartPlatformArgs) -> Any:
     def velocities(x, R, u, w):
         """Return the velocities of centres of mass and of turning, `(..., 13, 3)`, for twists
         `(..., 3)`."""
-        arms = local @ R.T
-        length, frames = _legs(np, base, arms + x, first_axes)
-        moving = u[..., None, :] + np.cross(w[..., None, :], arms)
-        turning, spins = _leg_rates(np, frames, length, first_axes, moving)
+        _, moving, _, turning, spins = _leg_motion(np, points, x, R, u, w)
         c = CENTER * size
         linear = np.concatenate([u[..., None, :], c * turning, moving - c * turning], axis=-2)
         return linear, np.concatenate([w[..., None, :], spins, spins], axis=-2)

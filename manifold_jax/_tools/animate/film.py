@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 
 from ..compare.approaches import Approach, APPROACHES
 from ..compare.task import as_rows, Task
-from ..compare.with_diffrax import LAST_MAX_STEPS, SOLVERS
+from ..compare.with_diffrax import LAST_MAX_STEPS, solve_task, SOLVERS
 from .sketches import SKETCHES
 
 
@@ -63,19 +63,7 @@ def _take(task: Task, approach: Approach, times: np.ndarray) -> Take:
     solve = approach.formulate(problem, SOLVERS[task.solver](), task.gain)
 
     def states(y0, args, ts):
-        return solve.function(
-            solve.terms,
-            solve.solver,
-            task.t0,
-            task.t1,
-            None,
-            y0,
-            args,
-            saveat=dfx.SaveAt(ts=ts),
-            stepsize_controller=dfx.PIDController(rtol=task.rtol, atol=task.atol),
-            max_steps=LAST_MAX_STEPS,
-            throw=False,
-        ).ys
+        return solve_task(task, solve, y0, args, dfx.SaveAt(ts=ts), LAST_MAX_STEPS).ys
 
     ys = jax.jit(states)(problem.y0, problem.args, jnp.asarray(times))
     lines = SKETCHES[problem.name](np.asarray(ys[0]), problem.args)

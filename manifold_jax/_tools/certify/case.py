@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import diffrax as dfx
 import equinox as eqx
@@ -24,6 +24,9 @@ _STAGES = 1e-12
 # Steps that a solve may take: Diffrax's default, with which most users run, and where that
 # is not enough. (It is a setting of checkpoints, too.)
 _MAX_STEPS, _MORE_STEPS = 4096, 16384
+
+
+Parameters: TypeAlias = Float[Array, " parameters"]
 
 
 class Stepping(NamedTuple):
@@ -65,8 +68,8 @@ class Case:
         """Solve once, adaptively, and keep the steps. Raises `RuntimeError` if that fails."""
         adaptive = Stepping(solver, dfx.PIDController(rtol=tolerance, atol=tolerance), _MORE_STEPS)
         case = Case(problem, approach, gain, t1, adaptive, adaptive)
-        adjoint, saveat = dfx.RecursiveCheckpointAdjoint(), dfx.SaveAt(steps=True)
-        sol = jax.jit(lambda theta: case._solve(theta, adjoint, adaptive, saveat))(case.theta)
+        saveat = dfx.SaveAt(steps=True)
+        sol = jax.jit(lambda theta: case._solve(theta, adaptive, saveat=saveat))(case.theta)
         if sol.result != dfx.RESULTS.successful:
             raise RuntimeError(f"the solve failed: {dfx.RESULTS[sol.result]}")
         ends = np.asarray(sol.ts)
@@ -83,7 +86,7 @@ class Case:
         )
 
     @property
-    def theta(self) -> Float[Array, " parameters"]:
+    def theta(self) -> Parameters:
         parameters = self.problem.y0 if self.problem.args is None else self.problem.args
         return jfu.ravel_pytree(parameters)[0]
 
@@ -93,50 +96,39 @@ class Case:
         formulation = self.approach.formulate(self.problem, self.adaptive.solver, self.gain)
         return isinstance(formulation.solver, AbstractManifoldSolver)
 
-    def problem_at(self, theta: Float[Array, " parameters"]) -> Problem:
+    def problem_at(self, theta: Parameters) -> Problem:
         if self.problem.args is None:
             return self.problem.with_initial(jfu.ravel_pytree(self.problem.y0)[1](theta))
         return self.problem.with_args(jfu.ravel_pytree(self.problem.args)[1](theta))
 
-    def _solve(
-        self,
-        theta: Float[Array, " parameters"],
-        adjoint: dfx.AbstractAdjoint,
-        stepping: Stepping,
-        saveat: dfx.SaveAt,
-    ) -> dfx.Solution:
+    def _solve(self, theta: Parameters, stepping: Stepping, **options: Any) -> dfx.Solution:
         problem = self.problem_at(theta)
-        function, terms, solver = self.approach.formulate(problem, stepping.solver, self.gain)
-        return function(
-            terms,
-            solver,
+        formulation = self.approach.formulate(problem, stepping.solver, self.gain)
+        return formulation.solve(
             problem.t0,
             self.t1,
-            None,
             problem.y0,
             problem.args,
-            saveat=saveat,
             stepsize_controller=stepping.controller,
-            adjoint=adjoint,
             max_steps=stepping.max_steps,
-            throw=False,
+            **options,
         )
 
     def end(
-        self, theta: Float[Array, " parameters"], adjoint: dfx.AbstractAdjoint, stepping: Stepping
+        self, theta: Parameters, adjoint: dfx.AbstractAdjoint, stepping: Stepping
     ) -> Float[Array, " n"]:
         """The last state; not a number if the solve fails."""
-        sol = self._solve(theta, adjoint, stepping, dfx.SaveAt(t1=True))
+        sol = self._solve(theta, stepping, adjoint=adjoint, saveat=dfx.SaveAt(t1=True))
         y = jfu.ravel_pytree(sol.ys)[0]
         return jnp.where(sol.result == dfx.RESULTS.successful, y, jnp.nan)
 
     def objective(
-        self, theta: Float[Array, " parameters"], adjoint: dfx.AbstractAdjoint, stepping: Stepping
+        self, theta: Parameters, adjoint: dfx.AbstractAdjoint, stepping: Stepping
     ) -> Float[Array, ""]:
         return _weighted_sum(self.end(theta, adjoint, stepping))
 
     def outcome(
-        self, theta: Float[Array, " parameters"], adjoint: dfx.AbstractAdjoint, stepping: Stepping
+        self, theta: Parameters, adjoint: dfx.AbstractAdjoint, stepping: Stepping
     ) -> tuple[Float[Array, ""], Float[Array, " n"], Float[Array, " m"]]:
         """The objective, the last state, and `g` there: its derivative is zero where
         sensitivities are tangent."""
@@ -151,8 +143,7 @@ class Case:
 
         def value(theta: np.ndarray) -> float:
             y = self.problem_at(jnp.asarray(theta)).reference(self.t1)
-            row = np.concatenate([np.ravel(leaf) for leaf in jax.tree_util.tree_leaves(y)])
-            return float(_weighted_sum(jnp.asarray(row)))
+            return float(_weighted_sum(jfu.ravel_pytree(y)[0]))
 
         if self.problem.args is None:
             return None  # moved off the manifold, where formulas do not hold

@@ -1,7 +1,6 @@
 """All ways to a gradient, compared."""
 
 import dataclasses
-import time
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any, Literal, NamedTuple
 
@@ -12,7 +11,7 @@ import numpy as np
 
 from ..._adjoint import StepReplayAdjoint
 from ..compare.approaches import Approach
-from ..compare.task import median_ms, Task
+from ..compare.task import compiled, median_ms, Task
 from .case import Case, differences
 
 
@@ -117,7 +116,8 @@ def certify(case: Case, adjoints: dict[str, dfx.AbstractAdjoint], hessian: bool)
     )
     (_, states, residuals), _ = outcomes = [outcome(theta) for theta in parameters]
     gradients = [np.asarray(gradient) for gradient, *_ in outcomes]
-    direction, curvature = _direction(case.theta), None
+    direction = jnp.cos(2 + jnp.arange(case.theta.size, dtype=case.theta.dtype)) * case.theta
+    curvature = None
     if hessian:
         by_forward = _gradient(case, "forward", ADJOINTS["forward"])
         curvature = np.asarray(_along(by_forward, direction)(case.theta))
@@ -151,20 +151,18 @@ def _by_differences(case: Case) -> float:
 def _check(case: Case, name: str, adjoint: dfx.AbstractAdjoint, forward: _Forward) -> Check:
     theta = case.theta
     gradient = jax.jit(_gradient(case, name, adjoint))
-    start = time.perf_counter()
     try:
-        compiled = gradient.lower(theta).compile()
+        program, compile_s = compiled(gradient, theta)
     except (ValueError, TypeError, NotImplementedError) as error:
         return Check(name, refused=str(error).strip().splitlines()[0])
-    compile_s = time.perf_counter() - start
-    analysis = compiled.memory_analysis()
+    analysis = program.memory_analysis()
     batch = np.asarray(jax.jit(jax.vmap(gradient))(forward.parameters))
     return Check(
         name,
-        difference=_relative(np.asarray(compiled(theta)), forward.gradients[0]),
+        difference=_relative(np.asarray(program(theta)), forward.gradients[0]),
         batch=float(np.max([*map(_relative, batch, forward.gradients)])),
         hessian=_hessian_difference(gradient, theta, forward),
-        run_ms=median_ms(lambda: jax.block_until_ready(compiled(theta))),
+        run_ms=median_ms(lambda: jax.block_until_ready(program(theta))),
         compile_s=compile_s,
         memory=None if analysis is None else int(analysis.temp_size_in_bytes),
     )
@@ -195,7 +193,3 @@ def _along(gradient: Callable[[Any], Any], direction: Any) -> Callable[[Any], An
 
 def _relative(a: np.ndarray, b: np.ndarray) -> float:
     return float(np.max(np.abs(a - b)) / np.max(np.abs(b)))
-
-
-def _direction(theta: Any) -> Any:
-    return jnp.cos(2 + jnp.arange(theta.size, dtype=theta.dtype)) * theta

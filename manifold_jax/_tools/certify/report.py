@@ -9,6 +9,7 @@ from typing import Any
 from rich.table import Table
 
 from ..compare.approaches import Approach
+from ..compare.report import format_number, number_columns
 from .checks import ADJOINTS, Check, Combination, ONCE, REFUSED
 
 
@@ -17,49 +18,39 @@ REVERSE_BOUND, DIFFERENCES_BOUND = 1e-10, 1e-7
 
 
 def certificate_title(combination: Combination) -> str:
-    title = f"{combination.approach}, {combination.solver}"
-    if combination.failure is not None:
-        return f"{title}: {combination.failure}"
-    return f"{title}: {combination.steps} steps"
+    outcome = combination.failure or f"{combination.steps} steps"
+    return f"{combination.approach}, {combination.solver}: {outcome}"
 
 
 def certificate_table(combination: Combination) -> Table:
     """The adjoints of one approach and solver."""
     hessian = any(check.hessian is not None for check in combination.checks)
-    table = Table()
-    table.add_column("adjoint")
     headings = ["gradient", "batch", *(["Hessian"] if hessian else ())]
-    for heading in (*headings, "run\n(ms)", "compile\n(s)", "memory\n(kB)"):
-        table.add_column(heading, justify="right")
+    headings += ["run\n(ms)", "compile\n(s)", "memory\n(kB)"]
+    table = Table("adjoint", *number_columns(headings))
     for check in combination.checks:
         if check.refused is not None:
             table.add_row(check.adjoint, "refused")
             continue
         table.add_row(
             check.adjoint,
-            _number(check.difference, ".1e"),
-            _number(check.batch, ".1e"),
-            *([_number(check.hessian, ".1e")] if hessian else ()),
-            _number(check.run_ms, ".2f"),
-            _number(check.compile_s, ".1f"),
-            _number(None if check.memory is None else check.memory / 1e3, ".0f"),
+            format_number(check.difference, ".1e"),
+            format_number(check.batch, ".1e"),
+            *([format_number(check.hessian, ".1e")] if hessian else ()),
+            format_number(check.run_ms, ".2f"),
+            format_number(check.compile_s, ".1f"),
+            format_number(None if check.memory is None else check.memory / 1e3, ".0f"),
         )
     return table
 
 
-def _number(value: float | str | None, form: str) -> str:
-    if isinstance(value, str):
-        return value
-    return "-" if value is None else format(value, form)
-
-
 def certificate_notes(combination: Combination) -> list[str]:
     """What else was found, and the verdict."""
-    exact = _number(combination.exact, ".1e") if combination.exact is not None else "not known"
+    exact = "not known" if combination.exact is None else combination.exact
     found = (
-        f"Forward mode: {_number(combination.differences, '.1e')} from finite differences with "
-        f"the same steps; gradient of the exact solution: {exact}; "
-        f"sensitivities from tangent: {_number(combination.tangency, '.1e')}."
+        f"Forward mode: {format_number(combination.differences, '.1e')} from finite differences with "
+        f"the same steps; gradient of the exact solution: {format_number(exact, '.1e')}; "
+        f"sensitivities from tangent: {format_number(combination.tangency, '.1e')}."
     )
     faults = faults_of(combination)
     verdict = f"NOT CERTIFIED: {'; '.join(faults)}." if faults else "Certified."
@@ -120,7 +111,7 @@ def _faults_of_adjoint(check: Check) -> list[str]:
 
 
 def _exceeds(name: str, value: float | None, bound: float) -> str:
-    return f"{name}: {_number(value, '.1e')} is not within {bound:g}"
+    return f"{name}: {format_number(value, '.1e')} is not within {bound:g}"
 
 
 def is_certified(combination: Combination) -> bool:

@@ -5,9 +5,10 @@ from typing import Annotated
 
 import typer
 
+from . import options
 from .arguments import check_can_draw, check_name, check_positive, check_target, task_for
 from .commands import app
-from .console import output_console, progress_bar
+from .console import output_console, print_lines, progress_bar
 
 
 @app.command()
@@ -21,11 +22,9 @@ def animate(
         ),
     ],
     out: Annotated[Path, typer.Option(metavar="FILE", help="The picture to write (gif).")],
-    solver: Annotated[
-        str, typer.Option(metavar="NAME", help="Adaptive solver of Diffrax, as in `compare`.")
-    ] = "tsit5",
-    rtol: Annotated[float, typer.Option(help="Relative tolerance.")] = 1e-4,
-    atol: Annotated[float, typer.Option(help="Absolute tolerance.")] = 1e-4,
+    solver: options.SolverName = "tsit5",
+    rtol: options.RelativeTolerance = 1e-4,
+    atol: options.AbsoluteTolerance = 1e-4,
     t1: Annotated[float, typer.Option(metavar="T", help="End of the time span.")] = 60.0,
     seconds: Annotated[
         float, typer.Option(help="How much of its end to show, in the time of the problem.")
@@ -55,8 +54,6 @@ def animate(
     with progress_bar() as progress:
         progress.add_task(f"{task.problem.name}: solving and drawing")
         takes = write_film(out, task, seconds)
-    output = output_console()
-    for take in takes:
-        text = f"{take.name + ':':<11} max |g| = {take.violations.max():.1e}"
-        output.print(text, highlight=False)
-    output.print(f"written: {out}, {out.stat().st_size / 1e6:.2f} MB", highlight=False)
+    lines = [f"{take.name + ':':<11} max |g| = {take.violations.max():.1e}" for take in takes]
+    lines.append(f"written: {out}, {out.stat().st_size / 1e6:.2f} MB")
+    print_lines(output_console(), lines)

@@ -8,6 +8,7 @@ from typing import Annotated
 
 import typer
 
+from . import options
 from .arguments import (
     check_can_draw,
     check_positive,
@@ -18,7 +19,7 @@ from .arguments import (
     names_in,
     task_for,
 )
-from .console import output_console, print_table, progress_bar
+from .console import output_console, print_lines, print_table, progress_bar
 
 
 app = typer.Typer(
@@ -55,9 +56,7 @@ def list_problems() -> None:
 
 @app.command()
 def compare(
-    problem: Annotated[
-        str, typer.Argument(metavar="PROBLEM", help="Name of the problem, see `manifold-jax list`.")
-    ],
+    problem: options.ProblemName,
     solver: Annotated[
         str,
         typer.Option(
@@ -76,10 +75,7 @@ def compare(
     ] = None,
     rtol: Annotated[float, typer.Option(help="Relative tolerance of all methods.")] = 1e-6,
     atol: Annotated[float, typer.Option(help="Absolute tolerance of all methods.")] = 1e-6,
-    t1: Annotated[
-        float | None,
-        typer.Option(metavar="T", help="End of the time span, by default that of the problem."),
-    ] = None,
+    t1: options.EndTime = None,
     gain: Annotated[
         float | None,
         typer.Option(
@@ -87,9 +83,7 @@ def compare(
             help="Gain of the stabilizations, 1/time, by default 30 / time span of the problem.",
         ),
     ] = None,
-    json: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Write the table as JSON, too.")
-    ] = None,
+    json: options.JsonFile = None,
     plot: Annotated[
         Path | None,
         typer.Option(
@@ -141,18 +135,16 @@ def compare(
             write_figure(plot, task, measurements)
     if json is not None:
         write_json(json, task, measurements, left_out)
+    notes = comparison_notes(task, measurements, left_out)
     output = output_console()
-    output.print(comparison_title(task), style="bold", highlight=False)
+    print_lines(output, [comparison_title(task)], style="bold")
     print_table(output, comparison_table(measurements))
-    for note in comparison_notes(task, measurements, left_out):
-        output.print(note, style="dim", highlight=False, markup=False)
+    print_lines(output, notes, style="dim")
 
 
 @app.command()
 def certify(
-    problem: Annotated[
-        str, typer.Argument(metavar="PROBLEM", help="Name of the problem, see `manifold-jax list`.")
-    ],
+    problem: options.ProblemName,
     methods: Annotated[
         str,
         typer.Option(
@@ -176,13 +168,8 @@ def certify(
         bool, typer.Option("--hessian", help="Hessian-vector products, too (twice the time).")
     ] = False,
     tolerance: Annotated[float, typer.Option(help="Of the steps, relative and absolute.")] = 1e-6,
-    t1: Annotated[
-        float | None,
-        typer.Option(metavar="T", help="End of the time span, by default that of the problem."),
-    ] = None,
-    json: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Write the table as JSON, too.")
-    ] = None,
+    t1: options.EndTime = None,
+    json: options.JsonFile = None,
 ) -> None:
     """Certify gradients: reverse mode against forward mode, and that against differences.
 
@@ -229,16 +216,13 @@ def certify(
     output = output_console()
     for row in rows:
         title = f"{task.problem.name}, {_certify.certificate_title(row)}"
-        output.print(title, style="bold", highlight=False)
+        print_lines(output, [title], style="bold")
         if row.checks:
             print_table(output, _certify.certificate_table(row))
-        for note in _certify.certificate_notes(row):
-            output.print(note, highlight=False, markup=False)
-        output.print()
+        print_lines(output, [*_certify.certificate_notes(row), ""])
     possible, _ = choose(None, known, task)
     missing = [approach.name for approach in possible if approach not in chosen]
-    for note in _certify.certificate_scope(rows, missing, left_out):
-        output.print(note, style="dim", highlight=False, markup=False)
+    print_lines(output, _certify.certificate_scope(rows, missing, left_out), style="dim")
     if not all(_certify.is_certified(row) for row in rows):
         raise typer.Exit(1)
 
@@ -263,17 +247,16 @@ def reduce(
 
     Exits with 1 if the equations cannot be reduced, and says which of them are at fault.
     """
-    arguments = model_at(model)
+    F, x, args, order = model_at(model)
     from ..._dae import reduce_dae
 
     output = output_console()
     try:
-        F, x, args, order = arguments
         dae = reduce_dae(F, x, args, order=order)
     except (TypeError, ValueError) as error:
-        output.print(str(error), highlight=False, markup=False)
+        print_lines(output, [str(error)])
         raise typer.Exit(1) from None
-    output.print(str(dae.report), highlight=False, markup=False, no_wrap=True, crop=False)
+    print_lines(output, [str(dae.report)], no_wrap=True, crop=False)
 
 
 @app.command()
@@ -294,7 +277,6 @@ def paper() -> None:
             rows.append(row)
             progress.update(status, description=f"Table 1: {len(rows)} of {len(TAUS)} lines")
     output = output_console()
-    output.print(TITLE, style="bold", highlight=False)
+    print_lines(output, [TITLE], style="bold")
     print_table(output, paper_table(rows))
-    for note in NOTES:
-        output.print(note, style="dim", highlight=False)
+    print_lines(output, NOTES, style="dim")

@@ -1,6 +1,7 @@
 """Where the command line writes, and tables that fit there."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from typing import Any
 
 from rich import box
 from rich.console import Console
@@ -25,6 +26,12 @@ def progress_bar() -> Progress:
         transient=True,
         disable=not console.is_terminal,
     )
+
+
+def print_lines(output: Console, lines: Iterable[str], **options: Any) -> None:
+    """Print texts as they are, each on its own line, with options such as a `style`."""
+    for line in lines:
+        output.print(line, highlight=False, markup=False, **options)
 
 
 def print_table(output: Console, table: Table) -> None:

@@ -2,13 +2,14 @@
 
 import time
 from pathlib import Path
-from typing import Annotated, TYPE_CHECKING
+from typing import Annotated, Any, TYPE_CHECKING
 
 import typer
 
+from . import options
 from .arguments import task_for
 from .commands import app
-from .console import output_console
+from .console import output_console, print_lines
 
 
 if TYPE_CHECKING:
@@ -17,9 +18,7 @@ if TYPE_CHECKING:
 
 @app.command()
 def ensemble(
-    problem: Annotated[
-        str, typer.Argument(metavar="PROBLEM", help="Name of the problem, see `manifold-jax list`.")
-    ],
+    problem: options.ProblemName,
     size: Annotated[int, typer.Option(metavar="N", min=1, help="How many trajectories.")],
     vary: Annotated[
         list[str],
@@ -33,15 +32,10 @@ def ensemble(
     resume: Annotated[
         bool, typer.Option("--resume", help="Continue what is there, with the same settings.")
     ] = False,
-    solver: Annotated[
-        str, typer.Option(metavar="NAME", help="Adaptive solver of Diffrax, as in `compare`.")
-    ] = "tsit5",
-    rtol: Annotated[float, typer.Option(help="Relative tolerance.")] = 1e-6,
-    atol: Annotated[float, typer.Option(help="Absolute tolerance.")] = 1e-6,
-    t1: Annotated[
-        float | None,
-        typer.Option(metavar="T", help="End of the time span, by default that of the problem."),
-    ] = None,
+    solver: options.SolverName = "tsit5",
+    rtol: options.RelativeTolerance = 1e-6,
+    atol: options.AbsoluteTolerance = 1e-6,
+    t1: options.EndTime = None,
     seed: Annotated[int, typer.Option(help="Of the random numbers.")] = 0,
     lanes: Annotated[
         int, typer.Option(min=1, help="How many trajectories advance together.")
@@ -101,14 +95,11 @@ def ensemble(
     output = output_console()
     title = f"{task.problem.name}: {size} trajectories from t = {task.t0:g} to {task.t1:g}, "
     title += f"{task.solver} projected, rtol {rtol:g}, atol {atol:g}"
-    output.print(title, style="bold", highlight=False)
-    for line in _summary(stored, [str(one) for one in drawn], size - before, seconds):
-        output.print(line, highlight=False, markup=False, soft_wrap=True)
+    print_lines(output, [title], style="bold")
+    print_lines(output, _summary(stored, drawn, size - before, seconds), soft_wrap=True)
 
 
-def _summary(stored: "StoredEnsemble", drawn: list[str], new: int, seconds: float) -> list[str]:
-    import numpy as np
-
+def _summary(stored: "StoredEnsemble", drawn: list[Any], new: int, seconds: float) -> list[str]:
     reasons = stored.failures_by_reason()
     steps, most, violation = 0, 0, 0.0
     for start in range(0, stored.size, stored.chunk):
@@ -116,8 +107,8 @@ def _summary(stored: "StoredEnsemble", drawn: list[str], new: int, seconds: floa
         count = stored.stats["num_steps"][part]
         steps, most = steps + int(count.sum()), max(most, int(count.max()))
         good = stored.ys["violation"][part][stored.result[part] == 0]
-        violation = max(violation, float(np.max(good, initial=0.0)))
-    lines = [f"varied:       {', '.join(drawn)}", f"failed:       {stored.num_failed}"]
+        violation = max(violation, float(good.max(initial=0.0)))
+    lines = [f"varied:       {', '.join(map(str, drawn))}", f"failed:       {stored.num_failed}"]
     for reason, (count, first) in reasons.items():
         numbers = ", ".join(map(str, first)) + (", ..." if count > len(first) else "")
         lines.append(f"  {count} (numbers {numbers}): {reason}")

@@ -51,7 +51,7 @@ _HINT = "--vary"
 def distributions(texts: list[str], problem: Problem) -> list[Distribution]:
     """Read a distribution of `NAME=KIND(A,B)` each, or an error that says what could have been
     asked for."""
-    known = list(_places(problem))
+    known = [*_names_in("args", problem.args), *_names_in("y0", problem.y0)]
     out: list[Distribution] = []
     for text in texts:
         match = re.fullmatch(r"\s*([\w.]+)\s*=\s*(\w+)\s*\(([^,()]+),([^,()]+)\)\s*", text)
@@ -118,14 +118,10 @@ class VariedProblem:
         return f"{self.problem.name} with {', '.join(map(str, self.varied))}"
 
     def sample(self, index: Array, key: Array) -> tuple[Any, Given]:
-        del index
-        keys = jax.random.split(key, len(self.varied))
-        places = _places(self.problem)
-        drawn = {
-            one.target: one.draw(k, places[one.target].dtype)
-            for one, k in zip(self.varied, keys, strict=True)
-        }
         problem = self.problem
+        dtype = jfu.ravel_pytree((problem.args, problem.y0))[0].dtype
+        keys = jax.random.split(key, len(self.varied))
+        drawn = {one.target: one.draw(k, dtype) for one, k in zip(self.varied, keys, strict=True)}
         of_args = {name: x for name, x in drawn.items() if name.startswith("args")}
         if of_args:
             problem = problem.with_args(_replaced("args", problem.args, of_args))
@@ -167,33 +163,20 @@ class ConstraintInArgs(AbstractConstraint):
         return self._of(args).faults(t, y, args.args)
 
 
-class _Place(NamedTuple):
-    """The place of a number in a tree of arrays."""
-
-    leaf: int
-    index: tuple[int, ...]
-    dtype: Any
-
-
-def _places(problem: Problem) -> dict[str, _Place]:
-    """Return the places of every number that can be varied, by name: `args.length`, `y0.0.1`."""
-    return {**_places_in("args", problem.args), **_places_in("y0", problem.y0)}
-
-
-def _places_in(name: str, tree: Any) -> dict[str, _Place]:
-    out = {}
-    for k, (path, leaf) in enumerate(jtu.tree_flatten_with_path(tree)[0]):
+def _names_in(name: str, tree: Any) -> list[str]:
+    """The names of the numbers in a tree, in the order in which it is ravelled: `args.length`,
+    `y0.0.1`."""
+    out = []
+    for path, leaf in jtu.tree_flatten_with_path(tree)[0]:
         words = jtu.keystr(path, simple=True, separator=".")
         for index in np.ndindex(*leaf.shape):
-            out[".".join(filter(None, [name, words, *map(str, index)]))] = _Place(
-                k, index, leaf.dtype
-            )
+            out.append(".".join(filter(None, [name, words, *map(str, index)])))
     return out
 
 
 def _replaced(name: str, tree: Any, drawn: dict[str, Array]) -> Any:
-    leaves, treedef = jtu.tree_flatten(tree)
-    for target, place in _places_in(name, tree).items():
+    numbers, unravel = jfu.ravel_pytree(tree)
+    for i, target in enumerate(_names_in(name, tree)):
         if target in drawn:
-            leaves[place.leaf] = leaves[place.leaf].at[place.index].set(drawn[target])
-    return jtu.tree_unflatten(treedef, leaves)
+            numbers = numbers.at[i].set(drawn[target])
+    return unravel(numbers)

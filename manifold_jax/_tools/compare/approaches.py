@@ -24,9 +24,18 @@ class Formulation(NamedTuple):
     terms: dfx.AbstractTerm
     solver: dfx.AbstractSolver
 
+    def solve(self, t0: Any, t1: Any, y0: Any, args: Any, **options: Any) -> dfx.Solution:
+        """The solution, with further options of `diffrax.diffeqsolve`; its `result` says whether the
+        solve failed."""
+        return self.function(
+            self.terms, self.solver, t0, t1, None, y0, args, throw=False, **options
+        )
 
-@dataclasses.dataclass(frozen=True)
-class Need:
+
+Formulate = Callable[[Problem, dfx.AbstractSolver, float], Formulation]
+
+
+class Need(NamedTuple):
     """What not every problem has: the attribute that is None then, and what it is called."""
 
     attribute: str
@@ -66,7 +75,7 @@ class Approach:
     """
 
     name: str
-    formulate: Callable[[Problem, dfx.AbstractSolver, float], Formulation]
+    formulate: Formulate
     style: Style
     needs: Need | None = None
     uses_gain: bool = False
@@ -82,58 +91,42 @@ def default_gain(problem: Problem) -> float:
 
 
 def _plain(problem: Problem, solver: dfx.AbstractSolver, gain: float) -> Formulation:
-    del gain
     return Formulation(dfx.diffeqsolve, problem.terms, solver)
 
 
-def _projected(problem: Problem, solver: dfx.AbstractSolver, gain: float) -> Formulation:
-    del gain
-    return Formulation(diffeqsolve, problem.terms, Projected(solver, problem.constraint))
+def _within(
+    hook: Callable, options: Callable[[Problem, float], dict[str, Any]] = lambda problem, gain: {}
+) -> Formulate:
+    """The solver in a step hook of this library, with `options(problem, gain)`; the field as it is."""
+
+    def formulate(problem: Problem, solver: dfx.AbstractSolver, gain: float) -> Formulation:
+        wrapped = hook(solver, problem.constraint, **options(problem, gain))
+        return Formulation(diffeqsolve, problem.terms, wrapped)
+
+    return formulate
 
 
-def _one_step(problem: Problem, solver: dfx.AbstractSolver, gain: float) -> Formulation:
-    del gain
-    hook = Projected(solver, problem.constraint, projection=NewtonProjection(max_steps=1))
-    return Formulation(diffeqsolve, problem.terms, hook)
-
-
-def _invariant(problem: Problem, solver: dfx.AbstractSolver, gain: float) -> Formulation:
-    hook = Stabilized(solver, problem.constraint, stabilization=InvariantStabilization(gain))
-    return Formulation(diffeqsolve, problem.terms, hook)
-
-
-def _exact(problem: Problem, solver: dfx.AbstractSolver, gain: float) -> Formulation:
-    hook = Stabilized(solver, problem.constraint, stabilization=ExactStabilization(gain))
-    return Formulation(diffeqsolve, problem.terms, hook)
+_projected = _within(Projected)
+_one_step = _within(Projected, lambda problem, gain: {"projection": NewtonProjection(max_steps=1)})
+_invariant = _within(
+    Stabilized, lambda problem, gain: {"stabilization": InvariantStabilization(gain)}
+)
+_exact = _within(Stabilized, lambda problem, gain: {"stabilization": ExactStabilization(gain)})
+_tangent = _within(LocalCoordinates, lambda problem, gain: {"chart": TangentSpaceChart()})
+_partition = _within(LocalCoordinates, lambda problem, gain: {"chart": CoordinatePartitionChart()})
+_lie_group = _within(LocalCoordinates, lambda problem, gain: {"chart": problem.chart})
 
 
 def _baumgarte(problem: Problem, solver: dfx.AbstractSolver, gain: float) -> Formulation:
     """Critical damping."""
     assert problem.system is not None
-    stabilization = Baumgarte(gain, gain)
     system = eqx.tree_at(
-        lambda s: s.stabilization, problem.system, stabilization, is_leaf=lambda x: x is None
+        lambda s: s.stabilization,
+        problem.system,
+        Baumgarte(gain, gain),
+        is_leaf=lambda x: x is None,
     )
     return Formulation(dfx.diffeqsolve, system.terms, solver)
-
-
-def _tangent(problem: Problem, solver: dfx.AbstractSolver, gain: float) -> Formulation:
-    del gain
-    hook = LocalCoordinates(solver, problem.constraint, chart=TangentSpaceChart())
-    return Formulation(diffeqsolve, problem.terms, hook)
-
-
-def _partition(problem: Problem, solver: dfx.AbstractSolver, gain: float) -> Formulation:
-    del gain
-    hook = LocalCoordinates(solver, problem.constraint, chart=CoordinatePartitionChart())
-    return Formulation(diffeqsolve, problem.terms, hook)
-
-
-def _lie_group(problem: Problem, solver: dfx.AbstractSolver, gain: float) -> Formulation:
-    del gain
-    assert problem.chart is not None
-    hook = LocalCoordinates(solver, problem.constraint, chart=problem.chart)
-    return Formulation(diffeqsolve, problem.terms, hook)
 
 
 def _of_other_packages() -> tuple[Approach, ...]:

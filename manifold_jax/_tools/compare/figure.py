@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, TypeAlias
 
 import jax.tree_util as jtu
 import matplotlib
@@ -24,12 +24,8 @@ FLOOR = 1e-17
 # sign would fill the panels.
 INTERVALS = 100
 
-
-class _Solved(NamedTuple):
-    """A measurement and how it is drawn."""
-
-    measurement: Measurement
-    style: dict[str, Any]
+# Measurements without failures, and how they are drawn.
+Solved: TypeAlias = Sequence[tuple[Any, dict[str, Any]]]
 
 
 def write_figure(path: Path, task: Task, measurements: Sequence[Measurement]) -> None:
@@ -38,20 +34,15 @@ def write_figure(path: Path, task: Task, measurements: Sequence[Measurement]) ->
     shape = np.shape(jtu.tree_leaves(task.problem.y0)[0])
     first = figure.add_subplot(1, 3, 1, projection="3d" if shape == (3,) else None)
     second, third = figure.add_subplot(1, 3, 2), figure.add_subplot(1, 3, 3)
-    solved = [_Solved(m, _style(m.key)) for m in measurements if not m.failure]
+    solved = [(m, _style(m.key)) for m in measurements if not m.failure]
     if shape in ((2,), (3,)):
         _draw_path(first, task, solved, shape[0])
     else:
         _draw_components(first, task, solved, int(np.prod(shape)))
     lines = _draw_violations(second, task, solved)
     _draw_errors(third, task, solved)
-    figure.legend(
-        lines,
-        [s.measurement.row.method for s in solved],
-        loc="outside lower center",
-        ncols=min(max(len(solved), 1), 6),
-        frameon=False,
-    )
+    names, columns = [m.row.method for m, _ in solved], min(max(len(solved), 1), 6)
+    figure.legend(lines, names, loc="outside lower center", ncols=columns, frameon=False)
     figure.suptitle(f"{task.problem.name}, rtol = {task.rtol:g}, atol = {task.atol:g}")
     figure.savefig(path, dpi=150)
 
@@ -61,7 +52,7 @@ def _style(key: str) -> dict[str, Any]:
     return dict(color=colour, linestyle=line, linewidth=1.2, zorder=1 if "scipy" in key else 2)
 
 
-def _draw_path(axes: Axes, task: Task, solved: Sequence, dimension: int) -> None:
+def _draw_path(axes: Axes, task: Task, solved: Solved, dimension: int) -> None:
     """The first leaf as a curve in the plane or in space."""
     # Nested, the first the widest: usually the curves are the same to the eye.
     for i, (measurement, style) in enumerate(solved):
@@ -86,7 +77,7 @@ def _draw_path(axes: Axes, task: Task, solved: Sequence, dimension: int) -> None
         axes.set_aspect("equal", adjustable="datalim")
 
 
-def _draw_components(axes: Axes, task: Task, solved: Sequence, count: int) -> None:
+def _draw_components(axes: Axes, task: Task, solved: Solved, count: int) -> None:
     """The first leaf over time, if it has too many components for a curve.
 
     Of one method only, as the lines of several could not be told apart; the other panels
@@ -94,14 +85,14 @@ def _draw_components(axes: Axes, task: Task, solved: Sequence, count: int) -> No
     """
     if not solved:
         return
-    measurement, _ = next((s for s in solved if s.measurement.key == "projected"), solved[0])
+    measurement, _ = next((s for s in solved if s[0].key == "projected"), solved[0])
     colours = matplotlib.colormaps["viridis"](np.linspace(0, 0.9, count))
     for i in range(count):
         axes.plot(task.grid, measurement.states[:, i], color=colours[i], linewidth=1)
     axes.set(xlabel="$t$", title=f"components, {measurement.row.method}")
 
 
-def _draw_violations(axes: Axes, task: Task, solved: Sequence) -> list:
+def _draw_violations(axes: Axes, task: Task, solved: Solved) -> list:
     lines = []
     for m, style in solved:
         lines += axes.semilogy(*_largest_in_intervals(task.grid, m.violations), **style)
@@ -110,7 +101,7 @@ def _draw_violations(axes: Axes, task: Task, solved: Sequence) -> list:
     return lines
 
 
-def _draw_errors(axes: Axes, task: Task, solved: Sequence) -> None:
+def _draw_errors(axes: Axes, task: Task, solved: Solved) -> None:
     axes.grid(alpha=0.3)
     axes.set(xlabel="$t$", title="error of the state, max norm")
     if task.reference() is None:

@@ -50,11 +50,10 @@ METHODS: tuple[Method, ...] = (
         )
         for approach in APPROACHES
     ),
-    Method("scipy RK45", functools.partial(run_scipy, method="RK45"), Style("#555555", "dotted")),
-    Method(
-        "scipy DOP853", functools.partial(run_scipy, method="DOP853"), Style("#888888", "dotted")
+    *(
+        Method(f"scipy {name}", functools.partial(run_scipy, method=name), Style(colour, "dotted"))
+        for name, colour in (("RK45", "#555555"), ("DOP853", "#888888"), ("LSODA", "#BBBBBB"))
     ),
-    Method("scipy LSODA", functools.partial(run_scipy, method="LSODA"), Style("#BBBBBB", "dotted")),
 )
 
 
@@ -111,14 +110,10 @@ def measure(task: Task, method: Method) -> Measurement:
     error_times, errors = _errors(task, run)
     row = Row(
         name,
-        accepted=run.accepted,
-        rejected=run.rejected,
-        evaluations=run.evaluations,
+        **run.costs,
         violation_steps=_largest(task.violations(run.step_times, run.steps)),
         violation_output=_largest(violations),
         error=None if errors is None else _largest(errors),
-        run_ms=run.run_ms,
-        compile_s=run.compile_s,
     )
     return Measurement(
         key,

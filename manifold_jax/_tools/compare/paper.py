@@ -8,7 +8,7 @@ keeps to the local tolerance `tau`.
 
 import math
 from collections.abc import Callable, Iterator
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import diffrax as dfx
 import jax.numpy as jnp
@@ -18,6 +18,7 @@ from rich.table import Table
 from ..._solve import diffeqsolve
 from ..._solver import Projected
 from ...problems import harmonic_oscillator
+from .report import number_columns
 
 
 TAUS = tuple(10.0**-k for k in range(1, 9))
@@ -102,25 +103,6 @@ def _euler(solver: dfx.AbstractSolver, h: float, N: int, limit: int) -> np.ndarr
     return np.asarray(sol.ys)[:N]
 
 
-def paper_table(rows: list[PaperRow]) -> Table:
-    table = Table()
-    for heading in (
-        "\ntau",
-        "\nh",
-        "\nN",
-        "g(x_N)\nclosed form",
-        "g(x_N)\nrun",
-        "\nerror",
-        "projected\nmax |g|",
-        "projected\nerror",
-        "\ngain",
-    ):
-        table.add_column(heading, justify="right")
-    for row in rows:
-        table.add_row(*(shown(value) for shown, value in zip(_FORMATS, row, strict=True)))
-    return table
-
-
 def _digits(count: int) -> Callable[[float], str]:
     """So many significant digits, with an exponent (without padding) below 1."""
 
@@ -137,14 +119,21 @@ def _gain(value: float) -> str:
     return f"{value:.1f}" if value < 1000 else f"{value:.0f}"
 
 
-_FORMATS: tuple[Callable, ...] = (
-    _digits(1),
-    _digits(5),
-    str,
-    _digits(7),
-    _digits(7),
-    _digits(5),
-    _digits(1),
-    _digits(5),
-    _gain,
-)
+_COLUMNS: dict[str, Callable[[Any], str]] = {
+    "\ntau": _digits(1),
+    "\nh": _digits(5),
+    "\nN": str,
+    "g(x_N)\nclosed form": _digits(7),
+    "g(x_N)\nrun": _digits(7),
+    "\nerror": _digits(5),
+    "projected\nmax |g|": _digits(1),
+    "projected\nerror": _digits(5),
+    "\ngain": _gain,
+}
+
+
+def paper_table(rows: list[PaperRow]) -> Table:
+    table = Table(*number_columns(_COLUMNS))
+    for row in rows:
+        table.add_row(*(shown(value) for shown, value in zip(_COLUMNS.values(), row, strict=True)))
+    return table

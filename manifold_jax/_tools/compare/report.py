@@ -4,18 +4,17 @@ import inspect
 import json
 import math
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
 import diffrax
 import jax
 import jax.flatten_util as jfu
-import jax.tree_util as jtu
 import numpy as np
 import scipy
 from rich.markup import escape
-from rich.table import Table
+from rich.table import Column, Table
 
 from ... import __version__
 from ...problems import Problem
@@ -24,26 +23,29 @@ from .methods import Measurement, Method
 from .task import OUTPUT_POINTS, Task
 
 
-# The methods for which the gain is.
+def number_columns(headings: Iterable[str]) -> list[Column]:
+    return [Column(heading, justify="right") for heading in headings]
+
+
+def format_number(value: int | float | str | None, form: str) -> str:
+    """A number in a table, in which a word may stand instead, and `-` for what is not known.
+    Where `form` asks for three digits, larger numbers have all before the point."""
+    if isinstance(value, str):
+        return value
+    if value is None:
+        return "-"
+    return format(value, ".0f" if form == ".3g" and value >= 100 else form)
 
 
 def sizes(problem: Problem) -> tuple[int, int]:
     """The number of states and the number of constraints, `n` and `m`."""
-    residual = jax.eval_shape(problem.constraint, problem.t0, problem.y0, problem.args)
-    return (
-        jfu.ravel_pytree(problem.y0)[0].size,
-        sum(math.prod(leaf.shape) for leaf in jtu.tree_leaves(residual)),
-    )
+    flat = lambda y: jfu.ravel_pytree(problem.constraint(problem.t0, y, problem.args))[0]
+    return jfu.ravel_pytree(problem.y0)[0].size, jax.eval_shape(flat, problem.y0).size
 
 
 def gallery_table(gallery: dict[str, Callable[[], Problem]]) -> Table:
-    table = Table()
-    table.add_column("name")
-    table.add_column("n", justify="right")
-    table.add_column("m", justify="right")
-    table.add_column("time span")
-    table.add_column("solution")
-    table.add_column("description", min_width=20)  # the only one to be wrapped
+    wrapped = Column("description", min_width=20)  # no other one is
+    table = Table("name", *number_columns(["n", "m"]), "time span", "solution", wrapped)
     for name, build in gallery.items():
         problem = build()
         table.add_row(
@@ -68,39 +70,28 @@ def comparison_title(task: Task) -> str:
     return f"{task.problem.name}, {task.solver}, {span}, rtol = {task.rtol:g}, atol = {task.atol:g}"
 
 
+# Headings short, so that they fit in a terminal of 80 columns; then the number of a row, and its form.
+_COLUMNS = {
+    "steps\naccepted": ("accepted", "d"),
+    "\nrejected": ("rejected", "d"),
+    "field\ncalls": ("evaluations", "d"),
+    "|g| at\nsteps": ("violation_steps", ".1e"),
+    "|g| at\noutput": ("violation_output", ".1e"),
+    "error of\nstate": ("error", ".1e"),
+    "run\n(ms)": ("run_ms", ".3g"),
+    "compile\n(s)": ("compile_s", ".2f"),
+}
+
+
 def comparison_table(measurements: Sequence[Measurement]) -> Table:
-    table = Table()
-    table.add_column("method")
-    # short, so that they fit in a terminal of 80 columns
-    for heading in (
-        "steps\naccepted",
-        "\nrejected",
-        "field\ncalls",
-        "|g| at\nsteps",
-        "|g| at\noutput",
-        "error of\nstate",
-        "run\n(ms)",
-        "compile\n(s)",
-    ):
-        table.add_column(heading, justify="right")
+    table = Table("method", *number_columns(_COLUMNS))
     for measurement in measurements:
-        row = measurement.row
-        table.add_row(
-            measurement.key,
-            _number(row.accepted, "d"),
-            _number(row.rejected, "d"),
-            _number(row.evaluations, "d"),
-            _number(row.violation_steps, ".1e"),
-            _number(row.violation_output, ".1e"),
-            _number(row.error, ".1e") if measurement.failure is None else "failed",
-            _number(row.run_ms, ".3g" if (row.run_ms or 0) < 100 else ".0f"),
-            _number(row.compile_s, ".2f"),
-        )
+        numbers = vars(measurement.row)
+        if measurement.failure is not None:
+            numbers = numbers | {"error": "failed"}
+        cells = [format_number(numbers[name], form) for name, form in _COLUMNS.values()]
+        table.add_row(measurement.key, *cells)
     return table
-
-
-def _number(value: int | float | None, fmt: str) -> str:
-    return "-" if value is None else format(value, fmt)
 
 
 def comparison_notes(
@@ -145,12 +136,7 @@ def write_json(
     """Everything in the table and how it was made. Unknown numbers are null."""
     n, m = sizes(task.problem)
     settings = {
-        "solver": task.solver,
-        "rtol": task.rtol,
-        "atol": task.atol,
-        "gain": task.gain,
-        "t0": task.t0,
-        "t1": task.t1,
+        **{name: getattr(task, name) for name in ("solver", "rtol", "atol", "gain", "t0", "t1")},
         "output_points": OUTPUT_POINTS,
         "max_steps": max_steps(measurements),
         "states": n,
@@ -158,10 +144,7 @@ def write_json(
         "device": jax.devices()[0].device_kind,
         "versions": {
             "manifold_jax": __version__,
-            "diffrax": diffrax.__version__,
-            "jax": jax.__version__,
-            "numpy": np.__version__,
-            "scipy": scipy.__version__,
+            **{module.__name__: module.__version__ for module in (diffrax, jax, np, scipy)},
         },
         "failures": {m.row.method: m.failure for m in measurements if m.failure is not None},
         "left_out": {method.name(task): str(method.needs) for method in left_out},

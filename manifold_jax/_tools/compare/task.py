@@ -30,6 +30,13 @@ def median_ms(run: Callable[[], Any]) -> float:
     return 1e3 * statistics.median(durations)
 
 
+def compiled(function: Any, *arguments: Any) -> tuple[jax.stages.Compiled, float]:
+    """The program of a `jax.jit` function, and the seconds it took to trace and compile."""
+    start = time.perf_counter()
+    program = function.lower(*arguments).compile()
+    return program, time.perf_counter() - start
+
+
 # Times at which solutions are compared, both ends included.
 OUTPUT_POINTS = 1001
 
@@ -63,18 +70,12 @@ class Task:
     def grid(self) -> np.ndarray:
         return np.linspace(self.t0, self.t1, OUTPUT_POINTS)
 
-    def initial_row(self) -> np.ndarray:
-        return np.asarray(jfu.ravel_pytree(self.problem.y0)[0])
-
-    def unravel(self, x: Any) -> Any:
-        return jfu.ravel_pytree(self.problem.y0)[1](x)
-
     def violations(self, times: np.ndarray, rows: np.ndarray) -> np.ndarray:
         """`max_i |g_i|` at each time, absolute (unlike `mj.constraint_violation`)."""
-        problem = self.problem
+        problem, unravel = self.problem, jfu.ravel_pytree(self.problem.y0)[1]
 
         def residual(t, x):
-            return jfu.ravel_pytree(problem.constraint(t, self.unravel(x), problem.args))[0]
+            return jfu.ravel_pytree(problem.constraint(t, unravel(x), problem.args))[0]
 
         g = jax.jit(jax.vmap(residual))(jnp.asarray(times), jnp.asarray(rows))
         return np.max(np.abs(np.asarray(g)), axis=1)
@@ -91,24 +92,21 @@ class Task:
 
 @dataclasses.dataclass(frozen=True)
 class Run:
-    """The result of a method: its solution and what it cost. `None` is "not known".
+    """The result of a method: its solution and what it cost.
 
     - `output`: states on the output grid, `(OUTPUT_POINTS, n)`.
     - `step_times`, `steps`: the ends of the accepted steps and the states there.
-    - `run_ms`: median run time, output on the grid and steps included; `compile_s`: tracing and
-        compiling the same program.
-    - `max_steps`: the limit under which it ran.
+    - `costs`: of its row in the table those of `accepted`, `rejected`, `evaluations`, `run_ms`
+        (median run time, output on the grid and steps included) and `compile_s` (tracing and
+        compiling the same program) that are known.
+    - `max_steps`: the limit under which it ran, if there is one.
     """
 
     output: np.ndarray
     step_times: np.ndarray
     steps: np.ndarray
-    accepted: int
-    rejected: int | None
-    evaluations: int | None
-    run_ms: float
-    compile_s: float | None
-    max_steps: int | None
+    costs: dict[str, Any]
+    max_steps: int | None = None
 
 
 def as_rows(ys: Any) -> np.ndarray:

@@ -1,8 +1,7 @@
 """Diffrax's solvers, plain and in the approaches of this library."""
 
-import time
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import diffrax as dfx
 import jax
@@ -12,38 +11,22 @@ import numpy as np
 from ..._solve import diffeqsolve
 from ..._solver import Stabilized
 from .approaches import Approach, Formulation, with_vector_field
-from .task import as_rows, median_ms, Run, SolveFailed, Task
+from .task import as_rows, compiled, median_ms, Run, SolveFailed, Task
 
 
 # Those with an error estimate that take one vector field (KenCarp and Sil3 take two).
 SOLVERS: dict[str, type[dfx.AbstractSolver]] = {
     solver.__name__.lower(): solver
     for solver in (
-        dfx.Heun,
-        dfx.Midpoint,
-        dfx.Ralston,
-        dfx.Bosh3,
-        dfx.Tsit5,
-        dfx.Dopri5,
-        dfx.Dopri8,
-        dfx.ImplicitEuler,
-        dfx.Kvaerno3,
-        dfx.Kvaerno4,
-        dfx.Kvaerno5,
+        dfx.Heun, dfx.Midpoint, dfx.Ralston, dfx.Bosh3, dfx.Tsit5, dfx.Dopri5, dfx.Dopri8,
+        dfx.ImplicitEuler, dfx.Kvaerno3, dfx.Kvaerno4, dfx.Kvaerno5,
     )
-}
+}  # fmt: skip
 
 # Diffrax has to know the number of steps beforehand: the limit starts at Diffrax's own
 # default and is doubled until the solve finishes, up to about a minute of steps.
 FIRST_MAX_STEPS = 4096
 LAST_MAX_STEPS = 2**20
-
-
-class _Outcome(NamedTuple):
-    ts: Any
-    ys: Any
-    stats: dict[str, Any]
-    result: dfx.RESULTS
 
 
 def run_diffrax(task: Task, approach: Approach) -> Run:
@@ -59,11 +42,11 @@ def run_diffrax(task: Task, approach: Approach) -> Run:
         program, seconds = _compiled(task, solve, saveat, max_steps)
         outcome = program()
     _raise_if_failed(outcome)
-    run_ms = median_ms(program)
-    stats = {name: int(outcome.stats[f"num_{name}_steps"]) for name in ("accepted", "rejected")}
-    evaluations = _explicit_evaluations(task, solve, sum(stats.values()))
+    costs = {name: int(outcome.stats[f"num_{name}_steps"]) for name in ("accepted", "rejected")}
+    evaluations = _explicit_evaluations(task, solve, sum(costs.values()))
     if evaluations is None:
         evaluations = _counted_evaluations(task, solve, max_steps)
+    costs |= {"evaluations": evaluations, "run_ms": median_ms(program), "compile_s": seconds}
     output, steps = outcome.ys
     step_times = np.asarray(outcome.ts[1])
     used = np.isfinite(step_times)
@@ -71,41 +54,29 @@ def run_diffrax(task: Task, approach: Approach) -> Run:
         output=as_rows(output),
         step_times=step_times[used],
         steps=as_rows(steps)[used],
-        **stats,
-        evaluations=evaluations,
-        run_ms=run_ms,
-        compile_s=seconds,
+        costs=costs,
         max_steps=max_steps,
     )
 
 
+def solve_task(
+    task: Task, formulation: Formulation, y0: Any, args: Any, saveat: dfx.SaveAt, max_steps: int
+) -> dfx.Solution:
+    """A solve over the time span of the task and with its tolerances."""
+    controller = dfx.PIDController(rtol=task.rtol, atol=task.atol)
+    options = dict(saveat=saveat, stepsize_controller=controller, max_steps=max_steps)
+    return formulation.solve(task.t0, task.t1, y0, args, **options)
+
+
 def _compiled(
     task: Task, solve: Formulation, saveat: dfx.SaveAt, max_steps: int
-) -> tuple[Callable[[], _Outcome], float]:
+) -> tuple[Callable[[], Any], float]:
     """The program, ready to run to its end, and the seconds it took to trace and compile."""
     problem = task.problem
-
-    def run(y0, args):
-        sol = solve.function(
-            solve.terms,
-            solve.solver,
-            task.t0,
-            task.t1,
-            None,
-            y0,
-            args,
-            saveat=saveat,
-            stepsize_controller=dfx.PIDController(rtol=task.rtol, atol=task.atol),
-            max_steps=max_steps,
-            throw=False,
-        )
-        return _Outcome(sol.ts, sol.ys, sol.stats, sol.result)
-
+    run = lambda y0, args: solve_task(task, solve, y0, args, saveat, max_steps)
     # Otherwise the second method profits from what was traced for the first.
     jax.clear_caches()
-    start = time.perf_counter()
-    program = jax.jit(run).lower(problem.y0, problem.args).compile()
-    seconds = time.perf_counter() - start
+    program, seconds = compiled(jax.jit(run), problem.y0, problem.args)
     return lambda: jax.block_until_ready(program(problem.y0, problem.args)), seconds
 
 
@@ -123,7 +94,7 @@ def _sufficient_max_steps(task: Task, solve: Formulation) -> int:
     return max_steps
 
 
-def _raise_if_failed(outcome: _Outcome) -> None:
+def _raise_if_failed(outcome: dfx.Solution) -> None:
     if outcome.result == dfx.RESULTS.max_steps_reached:
         raise SolveFailed(f"not finished after {LAST_MAX_STEPS} steps")
     if outcome.result == dfx.RESULTS.dt_min_reached:

@@ -19,10 +19,11 @@ def run_scipy(task: Task, method: str) -> Run:
     differences for its Jacobians.
     """
     problem = task.problem
+    x0, unravel = jfu.ravel_pytree(problem.y0)
 
     @jax.jit
     def field(t, x):
-        return jfu.ravel_pytree(problem.terms.vf(t, task.unravel(x), problem.args))[0]
+        return jfu.ravel_pytree(problem.terms.vf(t, unravel(x), problem.args))[0]
 
     def solve(grid: np.ndarray | None) -> Any:
         with warnings.catch_warnings():
@@ -31,7 +32,7 @@ def run_scipy(task: Task, method: str) -> Run:
             return scipy.integrate.solve_ivp(
                 lambda t, x: np.asarray(field(t, x)),
                 (task.t0, task.t1),
-                task.initial_row(),
+                np.asarray(x0),
                 method,
                 t_eval=grid,
                 rtol=task.rtol,
@@ -46,10 +47,9 @@ def run_scipy(task: Task, method: str) -> Run:
         output=on_grid.y.T,
         step_times=on_steps.t[1:],
         steps=on_steps.y.T[1:],
-        accepted=len(on_steps.t) - 1,
-        rejected=None,
-        evaluations=int(on_grid.nfev),
-        run_ms=median_ms(lambda: solve(task.grid)),
-        compile_s=None,
-        max_steps=None,
+        costs={
+            "accepted": len(on_steps.t) - 1,
+            "evaluations": int(on_grid.nfev),
+            "run_ms": median_ms(lambda: solve(task.grid)),
+        },
     )
