@@ -15,6 +15,7 @@ from manifold_jax import problems
 from manifold_jax._tools.certify import ADJOINTS, certificate_notes, certificate_scope, is_certified
 from manifold_jax._tools.certify.case import Case, differences, Stepping
 from manifold_jax._tools.certify.checks import certify, Check, Combination
+from manifold_jax._tools.certify.report import write_json
 from manifold_jax._tools.cli import app
 from manifold_jax._tools.compare.approaches import APPROACHES
 
@@ -42,6 +43,14 @@ def test_a_wrong_gradient_is_not_certified():
             assert not is_certified(dataclasses.replace(good, checks=(checks[0], bad)))
         assert not is_certified(dataclasses.replace(good, differences=max(wrong, 1e-6)))
     assert not is_certified(Combination("projected", "Tsit5", failure="the solve failed"))
+
+
+def test_a_gradient_that_is_not_finite_is_null_in_json(tmp_path):
+    file = tmp_path / "certificate.json"
+    write_json(file, {}, [Combination("projected", "Tsit5", differences=np.nan)])
+    assert "NaN" not in file.read_text()
+    (row,) = json.loads(file.read_text())["rows"]
+    assert row["differences"] is None
 
 
 def test_only_what_must_be_refused_may_be():

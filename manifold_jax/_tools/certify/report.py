@@ -1,7 +1,6 @@
 """The certificate as tables and as JSON."""
 
 import dataclasses
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -9,7 +8,7 @@ from typing import Any
 from rich.table import Table
 
 from ..compare.approaches import Approach
-from ..compare.report import format_number, number_columns
+from ..compare.report import format_number, number_columns, write_strict_json
 from .checks import ADJOINTS, Check, Combination, ONCE, REFUSED
 
 
@@ -120,4 +119,4 @@ def is_certified(combination: Combination) -> bool:
 
 def write_json(path: Path, settings: dict[str, Any], combinations: Sequence[Combination]) -> None:
     rows = [dataclasses.asdict(c) | {"certified": is_certified(c)} for c in combinations]
-    path.write_text(json.dumps({"settings": settings, "rows": rows}, indent=2) + "\n")
+    write_strict_json(path, {"settings": settings, "rows": rows})

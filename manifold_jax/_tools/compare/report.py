@@ -151,11 +151,15 @@ def write_json(
     }
     rows = [vars(measurement.row) for measurement in measurements]
     content = {"problem": task.problem.name, "settings": settings, "rows": rows}
+    write_strict_json(path, content)
+
+
+def write_strict_json(path: Path, content: dict[str, Any]) -> None:
+    """Write null for what JSON has no numbers for, NaN and infinity."""
     path.write_text(json.dumps(_strict(content), indent=2, allow_nan=False) + "\n")
 
 
 def _strict(value: Any) -> Any:
-    """JSON has neither NaN nor infinity."""
     if isinstance(value, dict):
         return {key: _strict(item) for key, item in value.items()}
     if isinstance(value, list):
