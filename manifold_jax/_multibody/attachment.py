@@ -1,6 +1,6 @@
 """Where joints and forces are attached: points and orthonormal frames in their two bodies."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -78,22 +78,20 @@ def attach(
     first, second = zip(
         *[_indices(bodies, t, name) for t, name in zip(things, names, strict=True)], strict=True
     )
-    pairs = [_ends(bodies, t, i, name) for t, i, name in zip(things, first, names, strict=True)]
-    is_drawn = np.array([pair[0] for pair in pairs])
-    given = stack([stack([pair[side] for pair in pairs]) for side in (1, 2)])
-    upright = np.array([0.0, 0.0, 1.0])
-    axes = [(upright, upright)] * len(things) if axes is None else axes
-    given_axes = stack([stack([pair[side] for pair in axes]) for side in (0, 1)])
+    placed = [_ends(bodies, t, i, name) for t, i, name in zip(things, first, names, strict=True)]
+    is_drawn, *ends = zip(*placed, strict=True)
+    axes = [joints.UPRIGHT] * len(things) if axes is None else axes
+    given = (stack([stack(side) for side in sides]) for sides in (ends, zip(*axes, strict=True)))
     index = first, second
-    points, frames = _in_bodies(bodies.drawing, np.asarray(index), given, is_drawn, given_axes)
+    points, frames = _in_bodies(bodies.drawing, np.asarray(index), np.array(is_drawn), *given)
     return Attachment(tuple(names), index, points, frames)
 
 
 @jax.jit  # one program, not one for each operation
 def _in_bodies(
-    drawing: Pose, index: Any, given: Array, is_drawn: Any, axes: Array
+    drawing: Pose, index: Any, is_drawn: Any, given: Array, axes: Array
 ) -> tuple[Float[Array, "2 k 3"], Float[Array, "2 k 3 3"]]:
-    origin, rotation = Placed.of_rows(with_ground(drawing)[index], drawing.planar)
+    origin, rotation = Placed.of(with_ground(drawing.coordinates)[index])
     given = in_space(given)
     in_body = turn_back(rotation, given - origin)
     frames = compose(jnp.swapaxes(rotation, -1, -2), basis(axes))
@@ -117,8 +115,8 @@ def _indices(bodies: Bodies, thing: Any, name: str) -> tuple[int, int]:
     return bodies.index(thing.first, name), bodies.index(thing.second, name)
 
 
-def name_all(given: Any, base: type, what: str) -> tuple[list[Any], tuple[str, ...]]:
-    """All joints or forces and their names, those that have none made of kind and bodies."""
+def name_all(given: Any, base: type, what: str) -> list[tuple[Any, str]]:
+    """All joints or forces with their names, those that have none made of kind and bodies."""
     things = check_sequence(f"{what}s", given, base, f"{what}s of `mj.multibody`")
     names, count = [], {}
     for thing in things:
@@ -129,4 +127,12 @@ def name_all(given: Any, base: type, what: str) -> tuple[list[Any], tuple[str, .
             count[name] = count.get(name, 0) + 1
             name = name if count[name] == 1 else f"{name} ({count[name]})"
         names.append(name)
-    return things, unique_names(what, names)
+    return list(zip(things, unique_names(what, names), strict=True))
+
+
+def grouped(things: Iterable[tuple], kind: Callable) -> dict[type, zip]:
+    """Of every `kind(*thing)`, in the order in which these come first, the parts of all its things."""
+    groups: dict[type, list[tuple]] = {}
+    for thing in things:
+        groups.setdefault(kind(*thing), []).append(thing)
+    return {kind: zip(*own, strict=True) for kind, own in groups.items()}

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from .._base.types import Args, FloatScalar, RealScalarLike
 from .attachment import Attachment
-from .checks import evaluate
+from .checks import Values
 from .frames import Frames, in_space
 from .rotations import dot, length_of, turn
 
@@ -34,11 +34,10 @@ class SpringLaws(eqx.Module):
     """`stiffness (x - rest) + damping x' - value` against coordinates `x` of `k` forces; `values` is
     `None` where nothing is driven."""
 
-    names: tuple[str, ...] = eqx.field(static=True)
     stiffness: Float[Array, " k"]
     rest: Float[Array, " k"]
     damping: Float[Array, " k"]
-    values: tuple | None
+    values: Values | None
 
     def force(
         self, x: Float[Array, " k"], rate: Float[Array, " k"], t: RealScalarLike, args: Args
@@ -46,7 +45,7 @@ class SpringLaws(eqx.Module):
         size = self.stiffness * (x - self.rest) + self.damping * rate
         if self.values is None:
             return size
-        return size - evaluate("value", self.values, t, args, (), self.names)
+        return size - self.values.at(t, args)
 
     def energy(self, x: Float[Array, " k"]) -> FloatScalar:
         return jnp.sum(self.stiffness * (x - self.rest) ** 2) / 2
@@ -124,16 +123,12 @@ class BodyLoads(AbstractLoads):
     """Forces at points of bodies, or torques."""
 
     torque: bool = eqx.field(static=True)
-    planar: bool = eqx.field(static=True)
-    names: tuple[str, ...] = eqx.field(static=True)
     bodies: tuple[int, ...] = eqx.field(static=True)
     points: Float[Array, "k 3"]
-    values: tuple
+    values: Values
 
     def wrench(self, t: RealScalarLike, frames: Frames, args: Args) -> Wrench:
-        index = np.asarray(self.bodies)
-        shape = (() if self.torque else (2,)) if self.planar else (3,)
-        value = evaluate("value", self.values, t, args, shape, self.names)
+        index, value = np.asarray(self.bodies), self.values.at(t, args)
         if value.ndim == 1:  # about the normal of the plane
             value = jnp.pad(value[:, None], ((0, 0), (2, 0)))
         value, none = in_space(value), jnp.zeros_like(self.points)

@@ -13,7 +13,7 @@ from .checks import floating
 from .mujoco_checks import disabled, import_mujoco, refuse_unsupported
 from .mujoco_forces import actuators, springs
 from .mujoco_tree import quaternion_of, Tree
-from .start import quaternion_rate
+from .rotations import quaternion_rate
 
 
 def from_mujoco(

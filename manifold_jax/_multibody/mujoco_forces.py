@@ -53,9 +53,9 @@ def _actuator(tree: Tree, control: Callable | None, i: int) -> list[AbstractForc
     bias = model.actuator_biasprm[i, :3] * (model.actuator_biastype[i] == affine)
     limits = tuple(map(float, model.actuator_ctrlrange[i]))
     limits = limits if model.actuator_ctrllimited[i] else (-np.inf, np.inf)
-    drive = _Drive(control, int(model.actuator_ctrladr[i]), gear * gain, limits)  # pyright: ignore[reportArgumentType]
-    found: list[AbstractForce] = []
-    found.append(Motor(joint, _Sum(drive, gear * float(bias[0])), name=name))  # pyright: ignore[reportCallIssue]
+    constant = gear * float(bias[0])
+    drive = _Drive(control, int(model.actuator_ctrladr[i]), gear * gain, limits, constant)  # pyright: ignore[reportArgumentType]
+    found: list[Any] = [Motor(joint, drive, name=name)]  # pyright: ignore[reportCallIssue]
     if bias[1] != 0 or bias[2] != 0:
         stiffness, damping = -(gear**2) * bias[1], -(gear**2) * bias[2]
         found.append(JointSpring(joint, stiffness, -zero, damping, name=f"{name} bias"))  # pyright: ignore[reportCallIssue]
@@ -63,12 +63,13 @@ def _actuator(tree: Tree, control: Callable | None, i: int) -> list[AbstractForc
 
 
 class _Drive(eqx.Module):
-    """One of the controls, within its limits, times a factor."""
+    """One of the controls, within its limits, times a factor, and a constant."""
 
     control: Callable | None
     index: int = eqx.field(static=True)
     factor: float = eqx.field(static=True)
     limits: tuple[float, float] = eqx.field(static=True)
+    constant: float = eqx.field(static=True)
 
     def __call__(self, t: RealScalarLike, args: Args) -> Float[Array, ""]:
         if self.control is None:
@@ -80,12 +81,4 @@ class _Drive(eqx.Module):
                     f"`control` must return the controls of all actuators, shape (nu,), got {value.shape}."
                 )
             value = value[self.index]
-        return self.factor * jnp.clip(value, *self.limits)
-
-
-class _Sum(eqx.Module):
-    drive: _Drive
-    constant: float = eqx.field(static=True)
-
-    def __call__(self, t: RealScalarLike, args: Args) -> Float[Array, ""]:
-        return self.drive(t, args) + self.constant
+        return self.factor * jnp.clip(value, *self.limits) + self.constant
