@@ -58,6 +58,7 @@ class Simulator(eqx.Module):
     """The user's model with all that is not fitted."""
 
     model: Any
+    transform: Transform
     y0: Any
     observe: Callable | None
     solver: Any
@@ -86,6 +87,10 @@ class Simulator(eqx.Module):
         args = parameters if isinstance(built, MechanicalSystem) else built.args
         return Setting(built.terms, built.constraint, y0, args)
 
+    def given(self, record: Any = 0) -> Setting:
+        """The same with the start values of the parameters."""
+        return self.setting(self.transform.unravel(self.transform.start), record)
+
     def wrapped(self, constraint: AbstractConstraint) -> Any:
         """The user's solver around a constraint that depends on the parameters."""
         if isinstance(self.solver, dfx.AbstractSolver):
@@ -95,21 +100,19 @@ class Simulator(eqx.Module):
     def observation(self, t: Any, y: Y, parameters: Any) -> Any:
         return y if self.observe is None else self.observe(t, y, parameters)
 
-    def beginning(self, x: Float[Array, " q"], piece: Piece, transform: Transform) -> Setting:
+    def beginning(self, x: Float[Array, " q"], piece: Piece) -> Setting:
         """The initial value problem of one piece; `x` as for `predict`."""
-        p = transform.start.size
-        setting = self.setting(transform.parameters(x[:p]), piece.record)
+        p = self.transform.start.size
+        setting = self.setting(self.transform.parameters(x[:p]), piece.record)
         base, unravel = jfu.ravel_pytree(setting.y0)
         y0 = unravel(jnp.where(piece.first, base, piece.guess) + piece.basis @ x[p:])
         constraint = at_start(setting.constraint, piece.start, y0, setting.args)
         return setting._replace(y0=y0, constraint=constraint)
 
-    def predict(
-        self, x: Float[Array, " q"], piece: Piece, transform: Transform, adjoint: Any
-    ) -> Prediction:
+    def predict(self, x: Float[Array, " q"], piece: Piece, adjoint: Any) -> Prediction:
         """`x`: the unknowns of the parameters, then tangent coordinates of the initial state."""
-        setting = self.beginning(x, piece, transform)
-        parameters = transform.parameters(x[: transform.start.size])
+        setting = self.beginning(x, piece)
+        parameters = self.transform.parameters(x[: self.transform.start.size])
         sol = diffeqsolve(
             setting.terms,
             self.wrapped(setting.constraint),

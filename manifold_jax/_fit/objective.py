@@ -30,7 +30,6 @@ class Objective(eqx.Module):
     """
 
     simulator: Simulator
-    transform: Transform
     pieces: Piece
     free: Any
     joints: Any
@@ -39,8 +38,11 @@ class Objective(eqx.Module):
     penalty: Any
     loss: Callable | None
     unravel: Callable = eqx.field(static=True)
-    records: int = eqx.field(static=True)
     reverse: bool = eqx.field(static=True)
+
+    @property
+    def transform(self) -> Transform:
+        return self.simulator.transform
 
     def chosen(self, u: Float[Array, " N"], batch: Any = None) -> tuple[Any, Piece]:
         """The unknowns of each piece, `(pieces, p + d)`, and the pieces: all, or some."""
@@ -71,14 +73,12 @@ class Solved(NamedTuple):
 
 def solve(u: Float[Array, " N"], objective: Objective, batch: Any = None) -> Solved:
     """Solve all pieces, or those of a batch. Failed ones give zeros, so that none of their
-    values gets into a derivative. No derivatives of many unknowns (`reverse`)."""
+    values gets into a derivative."""
     x, pieces = objective.chosen(jax.lax.stop_gradient(u), batch)
-    if objective.reverse:
-        return Solved(_backwards_all(objective, x, pieces), None)
 
     def one(x: Any, piece: Piece) -> Solved:
         def twice(x: Any) -> Any:
-            out = objective.simulator.predict(x, piece, objective.transform, dfx.ForwardMode())
+            out = objective.simulator.predict(x, piece, dfx.ForwardMode())
             return out, out
 
         matrices, out = jax.jacfwd(twice, has_aux=True)(x)
@@ -92,8 +92,7 @@ def solve(u: Float[Array, " N"], objective: Objective, batch: Any = None) -> Sol
 
 def _each(function: Callable, x: Any, pieces: Piece) -> Any:
     """Evaluate a function for every piece. A batch of one alone takes half as long again to trace,
-    and both branches of
-    every condition to run."""
+    and both branches of every condition to run."""
     if x.shape[0] > 1:
         return jax.vmap(function)(x, pieces)
     one = function(*jtu.tree_map(lambda leaf: leaf[0], (x, pieces)))
@@ -101,8 +100,7 @@ def _each(function: Callable, x: Any, pieces: Piece) -> Any:
 
 
 def gaps(objective: Objective, predicted: Prediction) -> Float[Array, "joints d"]:
-    """Return the gaps from the end of a piece to the start of the next, along the manifold
-    there."""
+    """The gaps from the end of a piece to the start of the next, along the manifold there."""
     j = objective.joints
     jump = predicted.end[j] - predicted.begin[j + 1]
     gap = jnp.sum(objective.pieces.basis[j + 1] * jump[:, :, None], axis=1)
@@ -167,7 +165,8 @@ def total_loss(
     then as above."""
     x, pieces = objective.chosen(u, batch)
     if objective.reverse:
-        predicted = _backwards_all(objective, x, pieces)
+        one = lambda x, piece: _backwards(x, (piece, objective.simulator))
+        predicted = _each(one, x, pieces)
         solved = Solved(predicted, None)
     else:
         solved = solve(u, objective, batch)
@@ -194,24 +193,18 @@ def _own_loss(objective: Objective, observed: Any, data: Any, weights: Any) -> F
     return loss
 
 
-def _backwards_all(objective: Objective, x: Any, pieces: Piece) -> Prediction:
-    rest = objective.simulator, objective.transform
-    return _each(lambda x, piece: _backwards(x, (piece, *rest)), x, pieces)
-
-
 @eqx.filter_custom_vjp
 def _backwards(x: Any, rest: Any) -> Prediction:
     """Differentiate for many unknowns: one sweep backwards instead of one forwards for each."""
-    piece, simulator, transform = rest
-    return simulator.predict(x, piece, transform, StepReplayAdjoint())
+    piece, simulator = rest
+    return simulator.predict(x, piece, StepReplayAdjoint())
 
 
 @_backwards.def_fwd
 def _backwards_fwd(perturbed: Any, x: Any, rest: Any) -> Any:
     del perturbed
-    piece, simulator, transform = rest
-    adjoint = StepReplayAdjoint()
-    out, pullback = jax.vjp(lambda x: simulator.predict(x, piece, transform, adjoint), x)
+    piece, simulator = rest
+    out, pullback = jax.vjp(lambda x: simulator.predict(x, piece, StepReplayAdjoint()), x)
     return out, (pullback, out)
 
 

@@ -91,18 +91,22 @@ def _flat_bounds(parameters: Any, bounds: Any) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _flat_prefix(prefix: Any, tree: Any, name: str, what: str) -> np.ndarray:
-    """A value for each number in `tree`, from a tree whose leaves hold for whole parts."""
-    spread = lambda value, part: jtu.tree_map(
-        lambda leaf: np.broadcast_to(np.asarray(value, float), leaf.shape), part
+    advice = (
+        f"`{name}` must be {what}, or have the structure and shapes of `parameters`, "
+        f"{jtu.tree_structure(tree)}."
+    )
+    return np.concatenate(list(map(np.ravel, jtu.tree_leaves(spread(prefix, tree, advice)))))
+
+
+def spread(prefix: Any, tree: Any, advice: str) -> Any:
+    """Numbers like those in `tree`, from a tree whose leaves hold for whole parts of it."""
+    fill = lambda value, part: jtu.tree_map(
+        lambda leaf: np.broadcast_to(np.asarray(value, float), np.shape(leaf)), part
     )
     try:
-        full = jtu.tree_map(spread, prefix, tree)
+        return jtu.tree_map(fill, prefix, tree)
     except (ValueError, TypeError) as error:
-        raise ValueError(
-            f"`{name}` must be {what}, or have the structure and shapes of `parameters`, "
-            f"{jtu.tree_structure(tree)}."
-        ) from error
-    return np.concatenate([np.ravel(leaf) for leaf in jtu.tree_leaves(full)])
+        raise ValueError(advice) from error
 
 
 def _entries(path: Any, shape: tuple[int, ...]) -> list[str]:
