@@ -137,14 +137,18 @@ def trace_curve(
         raise ValueError(f"{_MESSAGES[4]} Got {length}.")
     length = jnp.asarray(length, x0.dtype)
 
-    curve = Curve(convert_closure(function, x0, args), args, jnp.ones((), x0.dtype))
+    closed = convert_closure(lambda x: function(x, args), x0)
+    curve = Curve(closed, jnp.ones((), x0.dtype))
     curve, start, info, faults = start_on(curve, x0, as_direction(direction, x0, parameter))
     positive = (length > 0) & jnp.isfinite(length)
     arclengths = jnp.linspace(0, jnp.where(positive, length, 1), points, dtype=x0.dtype)
     solver = dfx.Tsit5() if solver is None else solver
     adjoint = StepReplayAdjoint() if adjoint is None else adjoint
-    options = dict(max_steps=max_steps, adjoint=adjoint)
-    sol, nodes = follow(curve, start, arclengths, solver, rtol, atol, options)
+    # A straight piece has no error that limits the steps, and a step that leaps over two crossings
+    # would notice neither.
+    controller = dfx.PIDController(rtol, atol, dtmax=arclengths[-1] / 50)
+    options = dict(stepsize_controller=controller, max_steps=max_steps, adjoint=adjoint)
+    sol, nodes = follow(curve, start, arclengths, solver, options)
     used, smooth = unbroken(nodes, rtol, atol)
     usable = positive & ~jnp.any(faults)
     used = jnp.where(usable, used, 0)

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from .._base.types import Args, BoolScalar, FloatScalar, IntScalar, RealScalarLike
+from .._base.types import BoolScalar, FloatScalar, IntScalar, RealScalarLike
 from .._constraint.constraint import Constraint
 from .._constraint.project import consistent_state
 from .._constraint.projection_info import ProjectionInfo
@@ -18,11 +18,6 @@ from .._linalg.dense import Elimination, reduction
 from .._linalg.newton import without_derivative
 from .._solve import diffeqsolve
 from .._solver import Projected
-
-
-# A straight piece has no error that limits the steps, and a step that leaps over two
-# crossings would notice neither.
-_STEPS_PER_LENGTH = 50
 
 
 @jax.custom_jvp
@@ -45,18 +40,17 @@ def _kernel_derivative(primals, tangents):
 
 
 class Curve(eqx.Module):
-    """`H(x, args) = 0`, `n` equations in `k = n + 1` unknowns, in the form of a constraint.
+    """`H(x) = 0`, `n` equations in `k = n + 1` unknowns, in the form of a constraint.
 
-    What the user's function closes over are leaves, so that it can be differentiated or
-    held fixed. `orientation` is 1 or -1.
+    What the function closes over, the user's `args` too, are leaves, so that it can be
+    differentiated or held fixed. `orientation` is 1 or -1.
     """
 
     function: Callable
-    args: Args
     orientation: FloatScalar
 
     def __call__(self, s: Any, x: Float[Array, " k"], args: Any = None) -> Float[Array, " n"]:
-        return self.function(x, self.args)
+        return self.function(x)
 
     def tangent(self, x: Float[Array, " k"]) -> Float[Array, " k"]:
         """The unit vector `tau` with `G tau = 0` and `det [G; tau^T]` of the sign of the
@@ -96,8 +90,6 @@ def follow(
     start: Float[Array, " k"],
     arclengths: Float[Array, " points"],
     solver: dfx.AbstractSolver,
-    rtol: RealScalarLike,
-    atol: RealScalarLike,
     options: dict[str, Any],
 ) -> tuple[dfx.Solution, Nodes]:
     """`dx/ds = tau(x)`: values at the arclengths, and the steps."""
@@ -110,7 +102,6 @@ def follow(
     sol = diffeqsolve(
         *(term, Projected(solver, Constraint(curve)), arclengths[0], arclengths[-1], None, start),
         saveat=dfx.SaveAt(subs=saved, dense=True),
-        stepsize_controller=dfx.PIDController(rtol, atol, dtmax=arclengths[-1] / _STEPS_PER_LENGTH),
         throw=False,
         consistent="assume",
         **options,

@@ -151,18 +151,14 @@ def gradient_flow(
     if not 0 < tolerance < 1:
         raise ValueError(f"`tolerance` must be between 0 and 1, got {tolerance}.")
     start, unravel = jfu.ravel_pytree(x0)
-    lagrangian = Lagrangian(
-        convert_closure(lambda x, args: objective(unravel(x), args), start, args),
-        convert_closure(
-            lambda x, args: residual_vector(constraint, 0.0, unravel(x), args), start, args
-        ),
-        args,
-    )
+    f = lambda x: objective(unravel(x), args)
+    g = lambda x: residual_vector(constraint, 0.0, unravel(x), args)
+    lagrangian = Lagrangian(convert_closure(f, start), convert_closure(g, start))
     fixed, start = without_derivative((lagrangian, start))
     faults = _start_faults(fixed, start)
     solver = dfx.Kvaerno3() if solver is None else solver
-    controller = dfx.PIDController(rtol, atol)
-    sol, size = _descend(fixed, start, t1, solver, controller, tolerance, max_steps)
+    options = dict(stepsize_controller=dfx.PIDController(rtol, atol), max_steps=max_steps)
+    sol, size = _descend(fixed, start, t1, solver, tolerance, options)
 
     usable = ~jnp.any(faults)
     arrived = sol.result == RESULTS.event_occurred
@@ -196,9 +192,8 @@ def _descend(
     start: Float[Array, " n"],
     t1: RealScalarLike,
     solver: dfx.AbstractSolver,
-    controller: dfx.PIDController,
     tolerance: float,
-    max_steps: int | None,
+    options: dict[str, Any],
 ) -> tuple[dfx.Solution, FloatScalar]:
     """Follow the projected gradient; also the typical size of the gradient."""
     largest = lambda v: jnp.max(jnp.abs(v))
@@ -215,12 +210,11 @@ def _descend(
     hook = Projected(solver, Constraint(lambda t, x, args: lagrangian.g(x)))
     sol = diffeqsolve(
         *(term, hook, jnp.zeros((), start.dtype), jnp.asarray(t1, start.dtype), None, start),
-        stepsize_controller=controller,
         adjoint=dfx.ForwardMode(),  # nothing is differentiated through the flow
         event=dfx.Event(stationary),
-        max_steps=max_steps,
         throw=False,
         consistent="assume",
+        **options,
     )
     return sol, jnp.maximum(size, jnp.finfo(start.dtype).tiny)
 

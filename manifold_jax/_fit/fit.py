@@ -10,7 +10,7 @@ import numpy as np
 import optimistix as optx
 
 from .data import check_times, make_records
-from .model import check_solver, Simulator
+from .model import as_function_of_constraint, Simulator
 from .optimize import Options
 from .parameters import make_transform
 from .pieces import make_pieces
@@ -143,7 +143,7 @@ def fit(
         model=model, parameters=parameters, ts=ts, data=data, y0=y0, sigma=sigma, states=states
     )
     check_times(ts)
-    check_solver(solver)
+    solver = as_function_of_constraint(solver)
     transform = make_transform(parameters, bounds, positive)
     if stepsize_controller is None:
         tolerance = _by_precision(1e-8, 1e-5)
@@ -188,9 +188,8 @@ def _unknowns(objective: Any, options: Options) -> list[Any]:
     transform = objective.transform
     states = objective.free.size * objective.pieces.basis.shape[-1]
     check_amount(transform.start.size + states, objective)
-    drawn = draw_points(transform, options.starts, options.seed)
-    whole = np.concatenate([drawn, np.zeros((len(drawn), states))], axis=1)
-    return [jnp.asarray(u, transform.start.dtype) for u in whole]
+    drawn = np.pad(draw_points(transform, options.starts, options.seed), ((0, 0), (0, states)))
+    return [jnp.asarray(u, transform.start.dtype) for u in drawn]
 
 
 def _by_precision(double: float, single: float) -> float:

@@ -61,7 +61,7 @@ class Simulator(eqx.Module):
     transform: Transform
     y0: Any
     observe: Callable | None
-    solver: Any
+    solver: Callable  # of the constraint, which depends on the parameters
     controller: dfx.AbstractStepSizeController
     dt0: Any
     max_steps: int | None = eqx.field(static=True)
@@ -91,31 +91,26 @@ class Simulator(eqx.Module):
         """The same with the start values of the parameters."""
         return self.setting(self.transform.unravel(self.transform.start), record)
 
-    def wrapped(self, constraint: AbstractConstraint) -> Any:
-        """The user's solver around a constraint that depends on the parameters."""
-        if isinstance(self.solver, dfx.AbstractSolver):
-            return Projected(self.solver, constraint)
-        return self.solver(constraint)
-
     def observation(self, t: Any, y: Y, parameters: Any) -> Any:
         return y if self.observe is None else self.observe(t, y, parameters)
 
     def beginning(self, x: Float[Array, " q"], piece: Piece) -> Setting:
         """The initial value problem of one piece; `x` as for `predict`."""
-        p = self.transform.start.size
-        setting = self.setting(self.transform.parameters(x[:p]), piece.record)
+        setting = self.setting(self.transform.parameters(x), piece.record)
         base, unravel = jfu.ravel_pytree(setting.y0)
-        y0 = unravel(jnp.where(piece.first, base, piece.guess) + piece.basis @ x[p:])
+        y0 = unravel(
+            jnp.where(piece.first, base, piece.guess) + piece.basis @ x[self.transform.start.size :]
+        )
         constraint = at_start(setting.constraint, piece.start, y0, setting.args)
         return setting._replace(y0=y0, constraint=constraint)
 
     def predict(self, x: Float[Array, " q"], piece: Piece, adjoint: Any) -> Prediction:
         """`x`: the unknowns of the parameters, then tangent coordinates of the initial state."""
         setting = self.beginning(x, piece)
-        parameters = self.transform.parameters(x[: self.transform.start.size])
+        parameters = self.transform.parameters(x)
         sol = diffeqsolve(
             setting.terms,
-            self.wrapped(setting.constraint),
+            self.solver(setting.constraint),
             piece.start,
             piece.ts[-1],
             self.dt0,
@@ -187,15 +182,18 @@ def _args_of(problem: Any, parameters: Any) -> Args:
     return problem.args._replace(**parameters)
 
 
-def check_solver(solver: Any) -> None:
+def as_function_of_constraint(solver: Any) -> Callable:
     if isinstance(solver, AbstractManifoldSolver):
         raise TypeError(
             "`solver` must not hold a constraint, as that depends on the parameters: pass the "
             "Diffrax solver inside (it is wrapped in `mj.Projected`), or "
             "`solver=lambda constraint: mj.LocalCoordinates(dfx.Tsit5(), constraint)`."
         )
-    if not isinstance(solver, dfx.AbstractSolver) and not callable(solver):
+    if isinstance(solver, dfx.AbstractSolver):
+        return eqx.Partial(Projected, solver)
+    if not callable(solver):
         raise TypeError(
             "`solver` must be a Diffrax solver or a function of the constraint that returns a "
             f"solver, got {type(solver).__name__}."
         )
+    return solver

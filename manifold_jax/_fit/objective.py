@@ -1,7 +1,7 @@
 """Residuals and losses of all pieces, and their derivatives."""
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import diffrax as dfx
 import equinox as eqx
@@ -15,6 +15,9 @@ from .._adjoint import StepReplayAdjoint
 from .._base.types import FloatScalar
 from .model import Piece, Prediction, Simulator
 from .parameters import Transform
+
+
+Unknowns: TypeAlias = Float[Array, " N"]
 
 
 class Objective(eqx.Module):
@@ -44,7 +47,7 @@ class Objective(eqx.Module):
     def transform(self) -> Transform:
         return self.simulator.transform
 
-    def chosen(self, u: Float[Array, " N"], batch: Any = None) -> tuple[Any, Piece]:
+    def chosen(self, u: Unknowns, batch: Any = None) -> tuple[Any, Piece]:
         """The unknowns of each piece, `(pieces, p + d)`, and the pieces: all, or some."""
         p, d = self.transform.start.size, self.pieces.basis.shape[-1]
         z = jnp.zeros((self.pieces.start.size, d), u.dtype)
@@ -62,7 +65,7 @@ class Solved(NamedTuple):
     values: Prediction
     matrices: Prediction | None
 
-    def around(self, u: Float[Array, " N"], objective: Objective, batch: Any = None) -> Prediction:
+    def around(self, u: Unknowns, objective: Objective, batch: Any = None) -> Prediction:
         """The predictions as a function of `u` that can be differentiated (once)."""
         x, _ = objective.chosen(u, batch)
         step = x - jax.lax.stop_gradient(x)
@@ -71,7 +74,7 @@ class Solved(NamedTuple):
         )
 
 
-def solve(u: Float[Array, " N"], objective: Objective, batch: Any = None) -> Solved:
+def solve(u: Unknowns, objective: Objective, batch: Any = None) -> Solved:
     """Solve all pieces, or those of a batch. Failed ones give zeros, so that none of their
     values gets into a derivative."""
     x, pieces = objective.chosen(jax.lax.stop_gradient(u), batch)
@@ -127,15 +130,14 @@ class Linearized(NamedTuple):
 
 
 @eqx.filter_jit
-def linearize(u: Float[Array, " N"], solved: Solved, objective: Objective) -> Linearized:
+def linearize(u: Unknowns, solved: Solved, objective: Objective) -> Linearized:
     def both(u: Any) -> Any:
         predicted = solved.around(u, objective)
         out = weighted(objective, predicted), gaps(objective, predicted)
         return out, out
 
     (J, C), (r, c) = jax.jacfwd(both, has_aux=True)(u)
-    values, p = objective.transform.values, objective.transform.start.size
-    slopes = jax.jvp(values, (u[:p],), (jnp.ones_like(u[:p]),))[1]
+    slopes = jax.jvp(objective.transform.values, (u,), (jnp.ones_like(u),))[1]
     return Linearized(r, J, c, C, slopes)
 
 
@@ -148,7 +150,7 @@ def stacked(u: Any, solved: Solved, objective: Objective) -> tuple[np.ndarray, n
     return J, np.concatenate([linear.r.ravel(), gaps.ravel()])
 
 
-def residuals(u: Float[Array, " N"], objective: Objective) -> tuple[Any, Any]:
+def residuals(u: Unknowns, objective: Objective) -> tuple[Any, Any]:
     """Return the residuals for least-squares solvers: of the data and of the joints; then the loss
     and all pieces."""
     solved = solve(u, objective)
@@ -158,9 +160,7 @@ def residuals(u: Float[Array, " N"], objective: Objective) -> tuple[Any, Any]:
     return (r, c), (0.5 * (jnp.sum(r * r) + jnp.sum(c * c)), solved)
 
 
-def total_loss(
-    u: Float[Array, " N"], objective: Objective, batch: Any = None
-) -> tuple[FloatScalar, Any]:
+def total_loss(u: Unknowns, objective: Objective, batch: Any = None) -> tuple[FloatScalar, Any]:
     """Return the loss for minimizers: the sum over all records, or the mean over those of a batch;
     then as above."""
     x, pieces = objective.chosen(u, batch)

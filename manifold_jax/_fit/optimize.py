@@ -10,7 +10,7 @@ import numpy as np
 import optax
 import optimistix as optx
 
-from .bounds import BESIDE, driven, left_if_linear, on_bounds, put_beside_bounds, put_on_bounds
+from .bounds import BESIDE, driven, linear_step, on_bounds, put_beside_bounds, put_on_bounds
 from .convergence import at_minimum, flat, stalled
 from .objective import gaps, Objective, residuals, Solved, total_loss
 from .progress import Meter
@@ -82,7 +82,9 @@ def _within_bounds(objective: Objective, u: Any, options: Options) -> Outcome:
         if not found.success or not np.any(side):
             return found
         beside = put_beside_bounds(found.u, side, BESIDE, transform)
-        left = left_if_linear(beside, side, look(beside, objective, options)[1], objective)
+        step = linear_step(beside, look(beside, objective, options)[1], objective)
+        # of the distances now, those at which the linearized problem is solved
+        left = 1 - side * step[: side.size]
         inside = (side != 0) & (left > 2) & returning
         if not np.any(inside):
             return found

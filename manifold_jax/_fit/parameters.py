@@ -30,7 +30,9 @@ class Transform(eqx.Module):
     names: tuple[str, ...] = eqx.field(static=True)
     unravel: Any = eqx.field(static=True)
 
-    def values(self, u: Float[Array, " p"]) -> Float[Array, " p"]:
+    def values(self, u: Float[Array, " N"]) -> Float[Array, " p"]:
+        """`theta` of the first `p` of all unknowns of a fit."""
+        u = u[: self.start.size]
         s, has_a, has_b = self.start, jnp.isfinite(self.lower), jnp.isfinite(self.upper)
         # Selected twice, as the derivative of a discarded infinity would be NaN.
         a, b = jnp.where(has_a, self.lower, s - 1), jnp.where(has_b, self.upper, s + 1)
@@ -41,7 +43,7 @@ class Transform(eqx.Module):
         between = a + (b - a) / (1 + jnp.exp(-(v + middle)))
         return jnp.where(has_a, jnp.where(has_b, between, above), jnp.where(has_b, below, free))
 
-    def parameters(self, u: Float[Array, " p"]) -> Any:
+    def parameters(self, u: Float[Array, " N"]) -> Any:
         return self.unravel(self.values(u))
 
 

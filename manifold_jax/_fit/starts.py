@@ -94,8 +94,7 @@ def optimize_all(
     """One after the other by the same compiled program, as compiling takes longer than a few fits.
     The best, and a table of all with the best first."""
     best, rows, several = None, [], len(points) > 1
-    p, transform = objective.transform.start.size, objective.transform
-    like = lambda u: jtu.tree_map(np.asarray, transform.parameters(u[:p]))
+    like = lambda u: jtu.tree_map(np.asarray, objective.transform.parameters(u))
     for number, (u, at) in enumerate(zip(points, seen, strict=True), 1):
         if np.all(at.failed):
             rows.append(Start(like(u), like(u), np.inf, 0, False, "every solve fails"))

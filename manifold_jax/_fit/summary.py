@@ -24,7 +24,7 @@ def summarize(
     u, transform = outcome.u, objective.transform
     observed, *_, failed = jtu.tree_map(np.asarray, outcome.solved.values)
     bad = np.any(failed.reshape(records.ts.shape[0], -1) > 0, axis=1)
-    theta = np.asarray(transform.values(u[: transform.start.size]))
+    theta = np.asarray(transform.values(u))
     quality = judge(u, outcome.solved, objective, records)
     prediction = _on_grid(observed, records)
     deviation = np.where(records.weights > 0, prediction - records.data, np.nan)

@@ -16,12 +16,10 @@ from .checks import check_shape, floating
 from .equations import DRIVEN
 from .forces import AbstractForce
 from .frames import Frames, in_space
-from .joint_groups import JointGroup, reactions, residuals
+from .joint_groups import group_restraints, JointGroup, reactions, residuals
 from .joints import AbstractRestraint, Revolute
-from .load_groups import group_forces
-from .loads import AbstractLoads, coordinate
+from .loads import AbstractLoads, coordinate, group_forces
 from .reading import Energy, JointForce, Motion, over_times, Times
-from .restraints import group_restraints
 from .rotations import rates_matrix, turn
 from .start import make_state
 from .system import ConstantAssembly, system_of

@@ -12,20 +12,20 @@ from jaxtyping import Array, Float
 from . import joints
 from .bodies import Bodies, Pose
 from .checks import check_sequence, stack, unique_names
-from .frames import Frames, in_space, Placed, with_ground
+from .frames import Frames, in_space, Placed, Vectors, with_ground
 from .rotations import basis, compose, dot, turn, turn_back
 
 
 class Sides(NamedTuple):
     """Points and frames of `k` joints in space, of their first and of their second bodies."""
 
-    first: Float[Array, "k 3"]
-    second: Float[Array, "k 3"]
+    first: Vectors
+    second: Vectors
     frame_first: Float[Array, "k 3 3"]
     frame_second: Float[Array, "k 3 3"]
 
     @property
-    def gap(self) -> Float[Array, "k 3"]:
+    def gap(self) -> Vectors:
         return self.second - self.first
 
     def cosine(self, i: int, j: int) -> Float[Array, " k"]:
@@ -64,7 +64,7 @@ class Attachment(eqx.Module):
         axes = compose(placed.rotation, self.axes)
         return Sides(at[0], at[1], axes[0], axes[1])
 
-    def velocities(self, frames: Frames, sides: Sides) -> Float[Array, "k 3"]:
+    def velocities(self, frames: Frames, sides: Sides) -> Vectors:
         """Return the velocities of the second points against the first."""
         arms = jnp.stack([sides.first, sides.second]) - frames.origin[self.index]
         moving = frames.velocity[self.index] + jnp.cross(frames.spin[self.index], arms)
@@ -75,16 +75,14 @@ def attach(
     bodies: Bodies, things: Sequence[Any], names: Sequence[str], axes: Sequence[Any] | None = None
 ) -> Attachment:
     """Points and frames of the drawing in the frames of the bodies; `axes` are pairs."""
-    first, second = zip(
-        *[_indices(bodies, t, name) for t, name in zip(things, names, strict=True)], strict=True
-    )
-    placed = [_ends(bodies, t, i, name) for t, i, name in zip(things, first, names, strict=True)]
-    is_drawn, *ends = zip(*placed, strict=True)
+    placed = [_ends(bodies, thing, name) for thing, name in zip(things, names, strict=True)]
+    index, is_drawn, ends = zip(*placed, strict=True)
     axes = [joints.UPRIGHT] * len(things) if axes is None else axes
-    given = (stack([stack(side) for side in sides]) for sides in (ends, zip(*axes, strict=True)))
-    index = first, second
-    points, frames = _in_bodies(bodies.drawing, np.asarray(index), np.array(is_drawn), *given)
-    return Attachment(tuple(names), index, points, frames)
+    of_sides = lambda pairs: stack([stack(side) for side in zip(*pairs, strict=True)])
+    first, second = zip(*index, strict=True)
+    given = np.array(is_drawn), of_sides(ends), of_sides(axes)
+    points, frames = _in_bodies(bodies.drawing, np.array((first, second)), *given)
+    return Attachment(tuple(names), (first, second), points, frames)
 
 
 @jax.jit  # one program, not one for each operation
@@ -98,21 +96,18 @@ def _in_bodies(
     return jnp.where(is_drawn[None, :, None], in_body, given), frames
 
 
-def _ends(bodies: Bodies, thing: Any, first: int, name: str) -> tuple[bool, Any, Any]:
-    if isinstance(thing, joints.Fixed) and thing.at is None and thing.points is None:
-        if first == len(bodies.names):
-            first = bodies.index(thing.second, name)
-        at = bodies.drawing.position[first]
-        return True, at, at
-    return joints.ends(thing, name, bodies.planar)
-
-
-def _indices(bodies: Bodies, thing: Any, name: str) -> tuple[int, int]:
+def _ends(bodies: Bodies, thing: Any, name: str) -> tuple[tuple[int, int], bool, tuple[Any, Any]]:
+    """The bodies of a joint or a force; whether its points are those of the drawing, and the points."""
     if thing.first == thing.second:
         raise ValueError(
             f"{name} connects {thing.first!r} with itself. Give two bodies, or `mj.multibody.GROUND`."
         )
-    return bodies.index(thing.first, name), bodies.index(thing.second, name)
+    index = bodies.index(thing.first, name), bodies.index(thing.second, name)
+    if isinstance(thing, joints.Fixed) and thing.at is None and thing.points is None:
+        moving = index[1] if index[0] == len(bodies.names) else index[0]
+        at = bodies.drawing.position[moving]
+        return index, True, (at, at)
+    return index, *joints.ends(thing, name, bodies.planar)
 
 
 def name_all(given: Any, base: type, what: str) -> list[tuple[Any, str]]:

@@ -1,6 +1,6 @@
 """Where the bodies are in space, and how they move: origins and rotation matrices of their frames."""
 
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -9,6 +9,9 @@ from jaxtyping import Array, Float
 
 from .bodies import Pose
 from .rotations import planar_rotation, rates_matrix, rotation_matrix, turn
+
+
+Vectors: TypeAlias = Float[Array, "k 3"]  # one for each of several joints or forces
 
 
 class Placed(NamedTuple):

@@ -138,8 +138,8 @@ WITH_AXIS = {
 UPRIGHT = np.array([0.0, 0.0, 1.0]), np.array([0.0, 0.0, 1.0])
 
 
-def ends(thing: Any, name: str, planar: bool) -> tuple[bool, Any, Any]:
-    """The two points of a joint or a force, and whether they are those of the drawing."""
+def ends(thing: Any, name: str, planar: bool) -> tuple[bool, tuple[Any, Any]]:
+    """Whether the two points of a joint or a force are those of the drawing, and the points."""
     if isinstance(thing, AbstractPointJoint):
         word, drawn = "at", None if thing.at is None else (thing.at, thing.at)
     else:
@@ -152,7 +152,7 @@ def ends(thing: Any, name: str, planar: bool) -> tuple[bool, Any, Any]:
     pair = as_pair(f"{name}: `{word}` must be a pair of points", pair)
     shape = (2 if planar else 3,)
     first, second = (check_shape(f"{name}: `{word}`", point, shape) for point in pair)
-    return drawn is not None, first, second
+    return drawn is not None, (first, second)
 
 
 def drawn_axes(joint: AbstractJoint, name: str, planar: bool) -> tuple[Any, Any]:

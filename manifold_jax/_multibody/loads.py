@@ -9,12 +9,17 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._base.types import Args, FloatScalar, RealScalarLike
-from .attachment import Attachment
-from .checks import Values
-from .frames import Frames, in_space
+from . import forces, joints
+from .attachment import attach, Attachment, grouped, name_all
+from .bodies import Bodies
+from .checks import check_shape, is_concrete, stack, Values
+from .equations import DRIVEN
+from .frames import Frames, in_space, Vectors
+from .joint_groups import attachment_of, find_joint, Found, JointGroup
 from .rotations import dot, length_of, turn
 
 
+_ADVICE = "Springs and motors belong to `Revolute` and `Prismatic` joints; between points use `Spring` and `LinearActuator`."
 Wrench = tuple[Float[Array, "n 3"], Float[Array, "n 3"]]  # forces, torques about the origins
 
 
@@ -66,13 +71,10 @@ class LineLoads(AbstractLoads):
         at_first = apply(frames, first, sides.first, pull, none)
         return add(at_first, apply(frames, second, sides.second, -pull, none))
 
-    def _pull(
-        self, t: RealScalarLike, gap: Float[Array, "k 3"], velocity: Float[Array, "k 3"], args: Args
-    ) -> Float[Array, "k 3"]:
+    def _pull(self, t: RealScalarLike, gap: Vectors, velocity: Vectors, args: Args) -> Vectors:
         """Return the forces on the first points. Where two coincide, the direction of their line
-        is that of their
-        motion: the limit of what has one, not a number for what jumps there from one side to the
-        other."""
+        is that of their motion: the limit of what has one, not a number for what jumps there from
+        one side to the other."""
         distance = length_of(gap)
         apart = distance > 0
         direction = gap / jnp.where(apart, distance, 1)[:, None]
@@ -141,13 +143,7 @@ class BodyLoads(AbstractLoads):
         return jnp.zeros((), frames.origin.dtype)
 
 
-def apply(
-    frames: Frames,
-    index: np.ndarray,
-    at: Float[Array, "k 3"],
-    force: Float[Array, "k 3"],
-    torque: Float[Array, "k 3"],
-) -> Wrench:
+def apply(frames: Frames, index: np.ndarray, at: Vectors, force: Any, torque: Any) -> Wrench:
     """Forces at points of space, and torques, summed for every body about its origin."""
     torque = torque + jnp.cross(at - frames.origin[index], force)
     none = jnp.zeros_like(frames.origin)
@@ -156,3 +152,61 @@ def apply(
 
 def add(a: Wrench, b: Wrench) -> Wrench:
     return a[0] + b[0], a[1] + b[1]
+
+
+_ADVICE = "Springs and motors belong to `Revolute` and `Prismatic` joints; between points use `Spring` and `LinearActuator`."
+
+
+def group_forces(
+    bodies: Bodies, groups: tuple[JointGroup, ...], given: Any
+) -> tuple[AbstractLoads, ...]:
+    in_joint = lambda force: isinstance(force, forces.AbstractJointForce)
+    named = [
+        (force, name, find_joint(groups, force.joint, name, _ADVICE) if in_joint(force) else None)
+        for force, name in name_all(given, forces.AbstractForce, "force")
+    ]
+    return tuple(_loads(kind, bodies, *own) for kind, own in grouped(named, _kind).items())
+
+
+def _kind(force: Any, name: str, found: Found | None) -> type:
+    """The kind of its joint if it is in one."""
+    if found is not None:
+        return found[0].kind
+    kinds = forces.AbstractLineForce, forces.Torque
+    return next((kind for kind in kinds if isinstance(force, kind)), forces.Force)
+
+
+def _loads(
+    kind: type, bodies: Bodies, things: tuple, names: tuple[str, ...], found: tuple
+) -> AbstractLoads:
+    if kind is forces.AbstractLineForce:
+        return LineLoads(attach(bodies, things, names), _laws(things, names, "length"))
+    if kind in DRIVEN:
+        laws = _laws(things, names, "rest")
+        return JointLoads(kind is joints.Revolute, attachment_of(found, names), laws)
+    return _on_bodies(kind is forces.Torque, bodies, things, names)
+
+
+def _laws(things: tuple, names: tuple[str, ...], rest: str) -> SpringLaws:
+    """What a force does not have is zero."""
+    named = list(zip(things, names, strict=True))
+    stiffness, rest_at, damping = (
+        stack([check_shape(f"{n}: `{word}`", getattr(thing, word, 0.0), ()) for thing, n in named])
+        for word in ("stiffness", rest, "damping")
+    )
+    values = Values("value", names, (), [getattr(thing, "value", 0.0) for thing in things])
+    driven = any(callable(v) or not is_concrete(v) or np.any(np.asarray(v)) for v in values.given)
+    return SpringLaws(stiffness, rest_at, damping, values if driven else None)
+
+
+def _on_bodies(torque: bool, bodies: Bodies, things: tuple, names: tuple[str, ...]) -> BodyLoads:
+    d = 2 if bodies.planar else 3
+    index, points = [], []
+    for thing, name in zip(things, names, strict=True):
+        index.append(bodies.moving_index(thing.body, name))
+        point = getattr(thing, "point", None)
+        point = np.zeros(d) if point is None else point
+        points.append(check_shape(f"{name}: `point`", point, (d,)))
+    shape = () if torque and bodies.planar else (d,)
+    values = Values("value", names, shape, [thing.value for thing in things])
+    return BodyLoads(torque, tuple(index), in_space(stack(points)), values)

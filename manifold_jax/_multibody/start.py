@@ -1,17 +1,38 @@
-"""States of an assembly, from what a user says of some bodies."""
+"""States of an assembly: from what a user says of some bodies, and whether and how they satisfy the joints,
+by NumPy where all numbers are known, otherwise (inside of `jit`, `vmap` and derivatives) in the program
+that is traced.
 
+Source of the assembly analysis: Haug, Computer Aided Kinematics and Dynamics of Mechanical Systems
+(1989), ch. 4, here with steps of least norm, `x - J^+ phi(x)` in what is free.
+"""
+
+import functools
 from collections.abc import Callable
 from typing import Any
 
+import equinox as eqx
+import jax
+import jax.flatten_util as jfu
+import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
 from .._base.types import Args
+from .._linalg.dense import pseudo_invert
 from .bodies import check_orientation, Pose
 from .checks import check_shape, is_concrete, on_host, stack
-from .closing import Closing
 from .rotations import quaternion_rate
+
+
+# Joints count as closed below this gap (m, or the cosine of an angle), or this many units of rounding.
+CLOSED, ROUNDING = 1e-6, 50
+ITERATIONS = 50
+# Singular values below this fraction of the largest belong to equations that depend on others; at
+# least a hundred units of rounding.
+DEPENDENT = 1e-9
+# Likewise eigenvalues of `J J^T`, in a program that is traced.
+DEPENDENT_TRACED = 1e-12
 
 
 def make_state(
@@ -66,3 +87,145 @@ def _place(
         i = bodies.moving_index(name, f"`{what}`")
         rows[i], has[i] = checked(f"`{what}` of {name!r}", value), True
     return stack(rows), has
+
+
+class Closing:
+    """The equations of an assembly as functions of the vector `x` of its coordinates, from the state
+    `x`, `w` whose `free_x`, `free_w` may be moved."""
+
+    def __init__(
+        self, assembly: Any, y: tuple[Pose, Pose], kept: tuple[Any, Any], t: Array, args: Args
+    ):
+        self.assembly, self.at = assembly, (t, args)
+        (self.x, self.unravel), (self.w, _) = map(jfu.ravel_pytree, y)
+        self.free_x, self.free_w = (np.flatnonzero(~part) for part in kept)
+        joints = assembly.system.holonomic
+        phi = lambda t, x: jfu.ravel_pytree(joints(t, self.unravel(x), args))[0]
+        self.phi = lambda x: phi(t, x)
+        self.jacobian = lambda x: jax.jacfwd(phi, 1)(t, x)
+        # The rates of the equations while nothing moves: those of drives.
+        self.driven = lambda x: jax.jvp(lambda t: phi(t, x), (t,), (jnp.ones_like(t),))[1]
+        compiled = jax.jit(lambda x: (self.phi(x), self.driven(x), self.jacobian(x)))
+        self.known = lambda x: map(np.asarray, compiled(x))
+
+    @functools.cached_property
+    def named_rows(self) -> list[tuple[str, np.ndarray]]:
+        """The rows of every joint among the equations."""
+        (t, args), bodies = self.at, self.assembly.bodies
+        of_joints = lambda: self.assembly.system.holonomic(t, bodies.drawing, args)
+        named, start = [], 0
+        for group, part in zip(self.assembly.joints, jax.eval_shape(of_joints), strict=False):
+            rows = start + np.arange(part.size).reshape(part.shape)
+            named += list(zip(group.attachment.names, rows, strict=True))
+            start += part.size
+        norms = () if bodies.planar else bodies.names
+        return named + [
+            (f"norm of {name!r}", np.array([start + i])) for i, name in enumerate(norms)
+        ]
+
+    def assembled(self) -> tuple[Pose, Pose]:
+        """Gauss-Newton steps of least norm in what is free; velocities by one."""
+        x, w = np.array(self.x), np.array(self.w)
+        for _ in range(ITERATIONS):
+            phi, _, J = self.known(x)
+            if np.abs(phi).max(initial=0) < 10 * np.finfo(x.dtype).eps:
+                break
+            x[self.free_x] -= np.linalg.lstsq(J[:, self.free_x], phi, rcond=_dependent(J))[0]
+        advice = "Whatever the other bodies do, the joints cannot be closed: check lengths and points, or give less."
+        self._check_positions(x, advice)
+        _, driven, J = self.known(x)
+        rate = driven + J @ w
+        w[self.free_w] -= np.linalg.lstsq(J[:, self.free_w], rate, rcond=_dependent(J))[0]
+        return self.unravel(jnp.asarray(x)), self.unravel(jnp.asarray(w))
+
+    def check(self, y: tuple[Pose, Pose]) -> None:
+        x, w = (np.array(jfu.ravel_pytree(part)[0]) for part in y)
+        advice = "Give `assemble=True` to close them, or correct positions and orientations."
+        self._check_positions(x, advice)
+        _, driven, J = self.known(x)
+        what = "The velocities do not agree with the joints"
+        advice = "Give only those that are known, such that joints allow them, and `assemble=True`."
+        most = _closed(x) * max(1, np.abs(w).max())
+        self._refuse_gaps(np.abs(driven + J @ w), most, "m/s", what, advice)
+        if not self.assembly.redundant:
+            self._check_rank(J)
+
+    def _check_positions(self, x: np.ndarray, advice: str) -> None:
+        phi, _, _ = self.known(x)
+        what = "The state does not satisfy the joints"
+        self._refuse_gaps(np.abs(phi), _closed(x), "m", what, advice)
+
+    def _refuse_gaps(
+        self, gaps: np.ndarray, most: float, unit: str, what: str, advice: str
+    ) -> None:
+        """Raise with the names of the joints that have the largest gaps, if there are some."""
+        if gaps.max(initial=0) <= most:
+            return
+        sizes = [(name, gaps[rows].max()) for name, rows in self.named_rows]
+        order = np.argsort([size for _, size in sizes])[::-1][:5]
+        largest = [sizes[i] for i in order if not sizes[i][1] <= most]
+        worst = ", ".join(f"{name} (gap {size:.3g} {unit})" for name, size in largest)
+        raise ValueError(f"{what}: {worst}. {advice}")
+
+    def _check_rank(self, J: np.ndarray) -> None:
+        J = J / np.maximum(np.linalg.norm(J, axis=1, keepdims=True), np.finfo(J.dtype).tiny)
+        left, sizes, _ = np.linalg.svd(J, full_matrices=True)
+        rank = int(np.sum(sizes > _dependent(J) * sizes.max(initial=1)))
+        if rank == J.shape[0]:
+            return
+        among = np.abs(left[:, rank:]).max(axis=1)
+        names = [name for name, rows in self.named_rows if among[rows].max() > 1e-6]
+        raise ValueError(
+            f"{J.shape[0] - rank} of the {J.shape[0]} equations of the joints depend on others in this pose, among those of "
+            f"{', '.join(names[:10])}{', ...' if len(names) > 10 else ''}. If they do so in every pose (closed loops), "
+            "write `Assembly(..., redundant=True)`; if in this one alone, start beside it."
+        )
+
+    def assembled_when_run(self) -> tuple[Pose, Pose]:
+        """The same steps in a traced program, with derivatives through all of them. While it runs an
+        error says which joint could not be closed."""
+
+        def corrected(x: Float[Array, " n"]) -> Float[Array, " n"]:
+            J = self.jacobian(x)[:, self.free_x]
+            return x.at[self.free_x].add(-_least_norm(J, self.phi(x)))
+
+        def iterate(x: Float[Array, " n"], _: Any) -> tuple[Float[Array, " n"], None]:
+            unfinished = jnp.max(jnp.abs(self.phi(x)), initial=0) >= 10 * jnp.finfo(x.dtype).eps
+            return jax.lax.cond(unfinished, corrected, lambda x: x, x), None
+
+        x, _ = jax.lax.scan(iterate, self.x, None, length=ITERATIONS)
+        x = corrected(x)  # of which the derivative is that of a root
+        J, driven = self.jacobian(x), self.driven(x)
+        rate = lambda w: driven + J @ w
+        w = self.w.at[self.free_w].add(-_least_norm(J[:, self.free_w], rate(self.w)))
+        largest = jnp.maximum(1, jnp.max(jnp.abs(jax.lax.stop_gradient(w)), initial=0))
+        x = self._raise_unless_closed(x, self.phi(x), "the joints cannot be closed")
+        fault = "the velocities given disagree with the joints"
+        w = self._raise_unless_closed(w, rate(w) / largest, fault)
+        return self.unravel(x), self.unravel(w)
+
+    def _raise_unless_closed(
+        self, x: Float[Array, " n"], gap: Float[Array, " m"], fault: str
+    ) -> Float[Array, " n"]:
+        gaps = jnp.stack([jnp.max(jnp.abs(gap[rows])) for _, rows in self.named_rows])
+        messages = [
+            f"`assemble=True`: whatever the other bodies do, {fault}, {name} least of all. Check lengths and points, or "
+            "give less."
+            for name, _ in self.named_rows
+        ]
+        failed = ~(jnp.max(gaps) <= _closed(np.zeros(1, x.dtype)))
+        worst = jnp.argmax(jnp.where(jnp.isnan(gaps), jnp.inf, gaps))
+        return eqx.branched_error_if(x, failed, worst, messages)
+
+
+def _least_norm(J: Float[Array, "m n"], b: Float[Array, " m"]) -> Float[Array, " n"]:
+    return J.T @ pseudo_invert(J @ J.T, equilibrated=True, dependent=DEPENDENT_TRACED).solve(b)
+
+
+def _closed(x: np.ndarray) -> float:
+    largest = float(np.abs(x).max(initial=1))
+    return max(CLOSED, ROUNDING * float(np.finfo(x.dtype).eps) * largest)
+
+
+def _dependent(J: np.ndarray) -> float:
+    return max(DEPENDENT, 100 * float(np.finfo(J.dtype).eps))
