@@ -113,16 +113,14 @@ def trace_curve(
 
     **Raises:**
 
-    `TypeError` or `ValueError` for arguments that cannot work. With `throw=True` a
-    `RuntimeError` if the start is not near the curve or singular, or if the trace meets a
-    singular point. At every step the tangent must turn by less than 60 degrees and agree
-    with the chord.
+    `TypeError` or `ValueError` for arguments that cannot work. With `throw=True` a `RuntimeError`
+    if the start is not near the curve or singular, or if the trace meets a singular point. At every
+    step the tangent must turn by less than 60 degrees and agree with the chord.
 
-    What it cannot see between two steps (at most `length / 50` apart): a pair of turning
-    points, and a singular point at which the tangent hardly turns (branches that touch; or
-    that cross at less than a degree, with tolerances above 1e-8). There is no branch
-    switching; AUTO and BifurcationKit have it, and sparse matrices for more than about a
-    hundred unknowns.
+    What it cannot see between two steps (at most `length / 50` apart): a pair of turning points,
+    and a singular point at which the tangent hardly turns (branches that touch; or that cross at
+    less than a degree, with tolerances above 1e-8). There is no branch switching; AUTO and
+    BifurcationKit have it, and sparse matrices for more than about a hundred unknowns.
 
     Source: Sudarsan & Keerthi, Appl. Math. Comput. 92 (1998) 153-193, section 2.2; Allgower
     & Georg, Numerical Continuation Methods, Springer 1990, chapters 2, 6 and 8.
@@ -137,8 +135,7 @@ def trace_curve(
         raise ValueError(f"{_MESSAGES[4]} Got {length}.")
     length = jnp.asarray(length, x0.dtype)
 
-    closed = convert_closure(lambda x: function(x, args), x0)
-    curve = Curve(closed, jnp.ones((), x0.dtype))
+    curve = Curve(convert_closure(function, x0, args), args, jnp.ones((), x0.dtype))
     curve, start, info, faults = start_on(curve, x0, as_direction(direction, x0, parameter))
     positive = (length > 0) & jnp.isfinite(length)
     arclengths = jnp.linspace(0, jnp.where(positive, length, 1), points, dtype=x0.dtype)

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from .._base.types import BoolScalar, FloatScalar, IntScalar, RealScalarLike
+from .._base.types import Args, BoolScalar, FloatScalar, IntScalar, RealScalarLike
 from .._constraint.constraint import Constraint
 from .._constraint.project import consistent_state
 from .._constraint.projection_info import ProjectionInfo
@@ -40,17 +40,18 @@ def _kernel_derivative(primals, tangents):
 
 
 class Curve(eqx.Module):
-    """`H(x) = 0`, `n` equations in `k = n + 1` unknowns, in the form of a constraint.
+    """`H(x, args) = 0`, `n` equations in `k = n + 1` unknowns, in the form of a constraint.
 
-    What the function closes over, the user's `args` too, are leaves, so that it can be
-    differentiated or held fixed. `orientation` is 1 or -1.
+    What the user's function closes over are leaves, so that it can be differentiated or
+    held fixed. `orientation` is 1 or -1.
     """
 
     function: Callable
+    args: Args
     orientation: FloatScalar
 
     def __call__(self, s: Any, x: Float[Array, " k"], args: Any = None) -> Float[Array, " n"]:
-        return self.function(x)
+        return self.function(x, self.args)
 
     def tangent(self, x: Float[Array, " k"]) -> Float[Array, " k"]:
         """The unit vector `tau` with `G tau = 0` and `det [G; tau^T]` of the sign of the

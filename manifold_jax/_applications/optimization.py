@@ -103,10 +103,9 @@ def gradient_flow(
     point is feasible, so that (up to the error of the steps) the minimum is the one whose
     basin `x0` is in.
 
-    The derivative with respect to `args`, and to everything that `objective` and
-    `constraint` hold or close over, is that of the stationary point itself (implicit
-    function), exact in forward and reverse mode and to any order. It is zero with respect
-    to `x0`.
+    The derivative with respect to `args`, and to everything that `objective` and `constraint` hold
+    or close over, is that of the stationary point itself (implicit function), exact in forward and
+    reverse mode and to any order. It is zero with respect to `x0`.
 
     **Arguments:**
 
@@ -151,9 +150,13 @@ def gradient_flow(
     if not 0 < tolerance < 1:
         raise ValueError(f"`tolerance` must be between 0 and 1, got {tolerance}.")
     start, unravel = jfu.ravel_pytree(x0)
-    f = lambda x: objective(unravel(x), args)
-    g = lambda x: residual_vector(constraint, 0.0, unravel(x), args)
-    lagrangian = Lagrangian(convert_closure(f, start), convert_closure(g, start))
+    lagrangian = Lagrangian(
+        convert_closure(lambda x, args: objective(unravel(x), args), start, args),
+        convert_closure(
+            lambda x, args: residual_vector(constraint, 0.0, unravel(x), args), start, args
+        ),
+        args,
+    )
     fixed, start = without_derivative((lagrangian, start))
     faults = _start_faults(fixed, start)
     solver = dfx.Kvaerno3() if solver is None else solver

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._base.types import BoolScalar, FloatScalar
+from .._base.types import Args, BoolScalar, FloatScalar
 from .._constraint.residual import jacobian, row_scale
 from .._linalg.dense import Elimination, Factorization, factorize, gram
 from .._linalg.newton import AbstractEquations, find_root, implicit_root, without_derivative
@@ -16,12 +16,19 @@ from .._linalg.newton import AbstractEquations, find_root, implicit_root, withou
 class Lagrangian(eqx.Module):
     """`L(x, lambda) = f(x) + lambda . g(x)`, for vectors.
 
-    What the functions close over, the user's `args` too, are leaves, so that it can be
-    differentiated or held fixed.
+    What the user's functions close over are leaves, so that it can be differentiated or
+    held fixed.
     """
 
-    f: Callable
-    g: Callable
+    objective: Callable
+    residual: Callable
+    args: Args
+
+    def f(self, x: Float[Array, " n"]) -> FloatScalar:
+        return self.objective(x, self.args)
+
+    def g(self, x: Float[Array, " n"]) -> Float[Array, " m"]:
+        return self.residual(x, self.args)
 
     def __call__(self, x: Float[Array, " n"], multipliers: Float[Array, " m"]) -> FloatScalar:
         return self.f(x) + multipliers @ self.g(x)

@@ -16,7 +16,7 @@ from .parameters import make_transform
 from .pieces import make_pieces
 from .progress import Meter
 from .report import FitResult
-from .setup import check_amount, check_initial, check_options, make_objective, refuse_tracers
+from .setup import check_initial, check_options, make_objective, refuse_tracers
 from .starts import choose, draw_points, optimize_all, see, with_scales
 from .summary import summarize
 
@@ -94,11 +94,10 @@ def fit(
         tangent space. The matrices grow with the number of records.
     - `loss`: instead of squares, `loss(prediction, data, weights)` of one record, to be summed
         over records; `weights` are `1 / sigma`, and 0 where a value is missing.
-    - `optimizer`: an Optimistix least-squares solver (default: Levenberg-Marquardt) or
-        minimizer (`optx.BFGS`), or any Optax optimizer. Steps of the unknowns are
-        relative to the start values. Prefer the default, but Optax for more than about 50
-        parameters (then by reverse mode and without standard errors) or more records than can be
-        solved in each step.
+    - `optimizer`: an Optimistix least-squares solver (default: Levenberg-Marquardt) or minimizer
+        (`optx.BFGS`), or any Optax optimizer. Steps of the unknowns are relative to the start
+        values. Prefer the default, but Optax for more than about 50 parameters (then by reverse
+        mode and without standard errors) or more records than can be solved in each step.
     - `steps`: the most of them; `patience`: stop after so many without a decrease.
     - `batch_size`: with Optax, records in each step, in an order drawn with `seed`; `steps` then counts
         passes through all records.
@@ -185,9 +184,16 @@ def fit(
 def _unknowns(objective: Any, options: Options) -> list[Any]:
     """Return the unknowns at all starts: those of the parameters, then those of initial states,
     which are at their guess."""
-    transform = objective.transform
-    states = objective.free.size * objective.pieces.basis.shape[-1]
-    check_amount(transform.start.size + states, objective)
+    transform, d = objective.transform, objective.pieces.basis.shape[-1]
+    states = objective.free.size * d
+    # Equations at the joints determine as many unknowns as the states there are.
+    unknowns = transform.start.size + states - objective.joints.size * d
+    values = int(jnp.sum(objective.pieces.weights > 0))
+    if values < unknowns:
+        raise ValueError(
+            f"`data` has {values} observed values for {unknowns} unknowns. Fit fewer "
+            "`parameters`, or measure more."
+        )
     drawn = np.pad(draw_points(transform, options.starts, options.seed), ((0, 0), (0, states)))
     return [jnp.asarray(u, transform.start.dtype) for u in drawn]
 

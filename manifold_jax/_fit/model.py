@@ -128,9 +128,8 @@ class Simulator(eqx.Module):
         finite = jnp.all(jnp.isfinite(states)) & jnp.all(jnp.isfinite(observed))
         failed = ~(is_okay(sol.result) & finite)
         keep = lambda values: jnp.where(failed, 0, values)
-        return Prediction(
-            keep(observed), keep(states[0]), keep(states[-1]), failed.astype(observed.dtype)
-        )
+        kept = keep(observed), keep(states[0]), keep(states[-1])
+        return Prediction(*kept, failed.astype(observed.dtype))
 
 
 def at_start(constraint: AbstractConstraint, t: Any, y: Y, args: Args) -> AbstractConstraint:

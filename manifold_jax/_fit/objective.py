@@ -69,9 +69,8 @@ class Solved(NamedTuple):
         """The predictions as a function of `u` that can be differentiated (once)."""
         x, _ = objective.chosen(u, batch)
         step = x - jax.lax.stop_gradient(x)
-        return jtu.tree_map(
-            lambda v, M: v + jax.vmap(jnp.matmul)(M, step), self.values, self.matrices
-        )
+        moved = lambda v, M: v + jax.vmap(jnp.matmul)(M, step)
+        return jtu.tree_map(moved, self.values, self.matrices)
 
 
 def solve(u: Unknowns, objective: Objective, batch: Any = None) -> Solved:

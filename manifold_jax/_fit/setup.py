@@ -80,17 +80,6 @@ def check_options(options: Options, loss: Any, segments: Any, records: Records) 
         )
 
 
-def check_amount(unknowns: int, objective: Objective) -> None:
-    """Equations at the joints determine as many unknowns as the states there are."""
-    joints = objective.joints.size * objective.pieces.basis.shape[-1]
-    values = int(jnp.sum(objective.pieces.weights > 0))
-    if values < unknowns - joints:
-        raise ValueError(
-            f"`data` has {values} observed values for {unknowns - joints} unknowns. Fit fewer "
-            "`parameters`, or measure more."
-        )
-
-
 def make_objective(
     simulator: Simulator,
     records: Records,

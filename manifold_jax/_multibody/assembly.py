@@ -18,7 +18,7 @@ from .forces import AbstractForce
 from .frames import Frames, in_space
 from .joint_groups import group_restraints, JointGroup, reactions, residuals
 from .joints import AbstractRestraint, Revolute
-from .loads import AbstractLoads, coordinate, group_forces
+from .loads import AbstractLoads, group_forces
 from .reading import Energy, JointForce, Motion, over_times, Times
 from .rotations import rates_matrix, turn
 from .start import make_state
@@ -170,7 +170,7 @@ class Assembly(eqx.Module):
         frames, found = Frames.of(*y), {}
         for group in self.joints:
             if group.kind in DRIVEN and group.motions is None:
-                values = coordinate(group.attachment.sides(frames), group.kind is Revolute)
+                values = group.attachment.sides(frames).coordinate(group.kind is Revolute)
                 found |= dict(zip(group.attachment.names, values, strict=True))
         return found
 
@@ -192,8 +192,8 @@ class Assembly(eqx.Module):
             forces, torques = reactions(group, frames, own)
             if self.bodies.planar:
                 forces, torques = forces[:, :2], torques[:, 2]
-            pairs = map(JointForce, forces, torques)
-            found |= dict(zip(group.attachment.names, pairs, strict=True))
+            on_second = map(JointForce, forces, torques)
+            found |= dict(zip(group.attachment.names, on_second, strict=True))
         return found
 
     @over_times

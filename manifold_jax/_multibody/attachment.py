@@ -41,6 +41,9 @@ class Sides(NamedTuple):
         """About the third axis, zero in the drawing, from `-pi` to `pi`."""
         return jnp.arctan2(self.cosine(1, 0), self.cosine(0, 0))
 
+    def coordinate(self, hinge: bool) -> Float[Array, " k"]:
+        return self.angle if hinge else self.along(2)
+
 
 class Attachment(eqx.Module):
     """Which bodies `k` joints or forces belong to (static: the graph of the mechanism), and their

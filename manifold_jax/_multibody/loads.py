@@ -106,7 +106,7 @@ class JointLoads(AbstractLoads):
         else:
             turning = jnp.cross(frames.spin[first], axis)
             rate = dot(axis, self.attachment.velocities(frames, sides)) + dot(turning, sides.gap)
-        push = -self.laws.force(coordinate(sides, self.hinge), rate, t, args)[:, None] * axis
+        push = -self.laws.force(sides.coordinate(self.hinge), rate, t, args)[:, None] * axis
         none = jnp.zeros_like(axis)
         force, torque = (none, push) if self.hinge else (push, none)
         # both at the second point: a slider's force and its opposite lie on one line
@@ -114,11 +114,7 @@ class JointLoads(AbstractLoads):
         return add(on_second, apply(frames, first, sides.second, -force, -torque))
 
     def potential(self, frames: Frames) -> FloatScalar:
-        return self.laws.energy(coordinate(self.attachment.sides(frames), self.hinge))
-
-
-def coordinate(sides: Any, hinge: bool) -> Float[Array, " k"]:
-    return sides.angle if hinge else sides.along(2)
+        return self.laws.energy(self.attachment.sides(frames).coordinate(self.hinge))
 
 
 class BodyLoads(AbstractLoads):
