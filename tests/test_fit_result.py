@@ -15,8 +15,8 @@ import manifold_jax as mj
 from manifold_jax._fit import convergence, optimize
 from manifold_jax._fit.parameters import make_transform
 from manifold_jax._fit.progress import Meter
+from manifold_jax._fit.quality import gauss_newton
 from manifold_jax._fit.starts import draw_points
-from manifold_jax._fit.uncertainty import gauss_newton
 
 
 SIGMA = 0.02

@@ -254,10 +254,11 @@ def test_energy_of_weight_and_springs_is_kept():
 
     # without dampers and constant forces nothing but weight and springs is left
     loads = tuple(
-        eqx.tree_at(lambda load: load.damping, load, jnp.zeros_like(load.damping))
+        eqx.tree_at(lambda load: load.laws.damping, load, jnp.zeros_like(load.laws.damping))
         for load in robot.loads
-        if hasattr(load, "damping")
+        if hasattr(load, "laws")
     )
+    assert len(loads) == 3  # between points, in hinges, in sliders
     robot = eqx.tree_at(lambda r: r.loads, robot, loads)
     assert abs(rate(robot, y)) < 1e-10
     assert abs(robot.energy(y).potential) > 0.1
@@ -290,7 +291,10 @@ def test_more_joints_are_no_more_operations():
         joints = [mb.Spherical(*p, at=(i - 0.5, 0, 0)) for i, p in enumerate(pairs)]
         robot = mb.Assembly(bodies, joints, gravity=GRAVITY)
         y = robot.state()
-        field = lambda y: (robot.system.force(0.0, *y, None), robot._equations(0.0, y[0], None))
+        field = lambda y: (
+            robot.system.force(0.0, *y, None),
+            robot.system.holonomic(0.0, y[0], None),
+        )
         return len(jax.make_jaxpr(field)(y).eqns)
 
     assert operations(3) == operations(40)
@@ -474,7 +478,7 @@ def test_points_of_springs_that_coincide(spring, expected):
     """What has a limit is that, with its derivatives; what has none is not a number."""
     robot = mb.Assembly([A, B], [], [spring])
     q, v = robot.state(None, None, {"a": (1.0, -2.0, 0.0)})
-    on_b = lambda q: robot._force(0.0, q, v, None).position[1]
+    on_b = lambda q: robot.system.force(0.0, q, v, None).position[1]
     value, slope = jax.jit(lambda q: (on_b(q), jax.jacfwd(on_b)(q)))(q)
     np.testing.assert_allclose(value, expected, rtol=0, atol=1e-15)
     if np.isfinite(expected).all():

@@ -113,16 +113,14 @@ def trace_curve(
 
     **Raises:**
 
-    `TypeError` or `ValueError` for arguments that cannot work. With `throw=True` a
-    `RuntimeError` if the start is not near the curve or singular, or if the trace meets a
-    singular point. At every step the tangent must turn by less than 60 degrees and agree
-    with the chord.
+    `TypeError` or `ValueError` for arguments that cannot work. With `throw=True` a `RuntimeError`
+    if the start is not near the curve or singular, or if the trace meets a singular point. At every
+    step the tangent must turn by less than 60 degrees and agree with the chord.
 
-    What it cannot see between two steps (at most `length / 50` apart): a pair of turning
-    points, and a singular point at which the tangent hardly turns (branches that touch; or
-    that cross at less than a degree, with tolerances above 1e-8). There is no branch
-    switching; AUTO and BifurcationKit have it, and sparse matrices for more than about a
-    hundred unknowns.
+    What it cannot see between two steps (at most `length / 50` apart): a pair of turning points,
+    and a singular point at which the tangent hardly turns (branches that touch; or that cross at
+    less than a degree, with tolerances above 1e-8). There is no branch switching; AUTO and
+    BifurcationKit have it, and sparse matrices for more than about a hundred unknowns.
 
     Source: Sudarsan & Keerthi, Appl. Math. Comput. 92 (1998) 153-193, section 2.2; Allgower
     & Georg, Numerical Continuation Methods, Springer 1990, chapters 2, 6 and 8.
@@ -143,8 +141,11 @@ def trace_curve(
     arclengths = jnp.linspace(0, jnp.where(positive, length, 1), points, dtype=x0.dtype)
     solver = dfx.Tsit5() if solver is None else solver
     adjoint = StepReplayAdjoint() if adjoint is None else adjoint
-    options = dict(max_steps=max_steps, adjoint=adjoint)
-    sol, nodes = follow(curve, start, arclengths, solver, rtol, atol, options)
+    # A straight piece has no error that limits the steps, and a step that leaps over two crossings
+    # would notice neither.
+    controller = dfx.PIDController(rtol, atol, dtmax=arclengths[-1] / 50)
+    options = dict(stepsize_controller=controller, max_steps=max_steps, adjoint=adjoint)
+    sol, nodes = follow(curve, start, arclengths, solver, options)
     used, smooth = unbroken(nodes, rtol, atol)
     usable = positive & ~jnp.any(faults)
     used = jnp.where(usable, used, 0)

@@ -20,11 +20,6 @@ from .._solve import diffeqsolve
 from .._solver import Projected
 
 
-# A straight piece has no error that limits the steps, and a step that leaps over two
-# crossings would notice neither.
-_STEPS_PER_LENGTH = 50
-
-
 @jax.custom_jvp
 def kernel(G: Float[Array, "n k"]) -> Float[Array, " k"]:
     """The unit vector `tau` with `G tau = 0` and `det [G; tau^T] > 0`, for `k = n + 1`.
@@ -96,8 +91,6 @@ def follow(
     start: Float[Array, " k"],
     arclengths: Float[Array, " points"],
     solver: dfx.AbstractSolver,
-    rtol: RealScalarLike,
-    atol: RealScalarLike,
     options: dict[str, Any],
 ) -> tuple[dfx.Solution, Nodes]:
     """`dx/ds = tau(x)`: values at the arclengths, and the steps."""
@@ -110,7 +103,6 @@ def follow(
     sol = diffeqsolve(
         *(term, Projected(solver, Constraint(curve)), arclengths[0], arclengths[-1], None, start),
         saveat=dfx.SaveAt(subs=saved, dense=True),
-        stepsize_controller=dfx.PIDController(rtol, atol, dtmax=arclengths[-1] / _STEPS_PER_LENGTH),
         throw=False,
         consistent="assume",
         **options,

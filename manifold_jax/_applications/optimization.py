@@ -103,10 +103,9 @@ def gradient_flow(
     point is feasible, so that (up to the error of the steps) the minimum is the one whose
     basin `x0` is in.
 
-    The derivative with respect to `args`, and to everything that `objective` and
-    `constraint` hold or close over, is that of the stationary point itself (implicit
-    function), exact in forward and reverse mode and to any order. It is zero with respect
-    to `x0`.
+    The derivative with respect to `args`, and to everything that `objective` and `constraint` hold
+    or close over, is that of the stationary point itself (implicit function), exact in forward and
+    reverse mode and to any order. It is zero with respect to `x0`.
 
     **Arguments:**
 
@@ -161,8 +160,8 @@ def gradient_flow(
     fixed, start = without_derivative((lagrangian, start))
     faults = _start_faults(fixed, start)
     solver = dfx.Kvaerno3() if solver is None else solver
-    controller = dfx.PIDController(rtol, atol)
-    sol, size = _descend(fixed, start, t1, solver, controller, tolerance, max_steps)
+    options = dict(stepsize_controller=dfx.PIDController(rtol, atol), max_steps=max_steps)
+    sol, size = _descend(fixed, start, t1, solver, tolerance, options)
 
     usable = ~jnp.any(faults)
     arrived = sol.result == RESULTS.event_occurred
@@ -196,9 +195,8 @@ def _descend(
     start: Float[Array, " n"],
     t1: RealScalarLike,
     solver: dfx.AbstractSolver,
-    controller: dfx.PIDController,
     tolerance: float,
-    max_steps: int | None,
+    options: dict[str, Any],
 ) -> tuple[dfx.Solution, FloatScalar]:
     """Follow the projected gradient; also the typical size of the gradient."""
     largest = lambda v: jnp.max(jnp.abs(v))
@@ -215,12 +213,11 @@ def _descend(
     hook = Projected(solver, Constraint(lambda t, x, args: lagrangian.g(x)))
     sol = diffeqsolve(
         *(term, hook, jnp.zeros((), start.dtype), jnp.asarray(t1, start.dtype), None, start),
-        stepsize_controller=controller,
         adjoint=dfx.ForwardMode(),  # nothing is differentiated through the flow
         event=dfx.Event(stationary),
-        max_steps=max_steps,
         throw=False,
         consistent="assume",
+        **options,
     )
     return sol, jnp.maximum(size, jnp.finfo(start.dtype).tiny)
 

@@ -1,7 +1,6 @@
 """First and second order conditions for a minimum of `f(x)` subject to `g(x) = 0`."""
 
 from collections.abc import Callable
-from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -68,15 +67,6 @@ class Lagrangian(eqx.Module):
         return jnp.min(jnp.linalg.eigvalsh(P @ H @ P + size * normal)), size
 
 
-class StationaryPoint(NamedTuple):
-    """Where the first order conditions hold, and what the second order ones say."""
-
-    x: Float[Array, " n"]
-    multipliers: Float[Array, " m"]
-    curvature: FloatScalar
-    is_minimum: BoolScalar
-
-
 class _Conditions(AbstractEquations):
     """`grad f + G^T lambda = 0` and `g = 0`, each row divided by its typical size."""
 
@@ -98,8 +88,9 @@ class _Conditions(AbstractEquations):
 
 def stationary_point(
     lagrangian: Lagrangian, near: Float[Array, " n"], reach: FloatScalar, size: FloatScalar
-) -> StationaryPoint:
-    """The point at which the first order conditions hold, with its derivative.
+) -> tuple[Float[Array, " n"], Float[Array, " m"], FloatScalar, BoolScalar]:
+    """The point at which the first order conditions hold, with its derivative; its multipliers and
+    curvature, and whether it is a minimum.
 
     Newton's method from `near`, which must be good already: a result that is further away
     than `reach (|x| + 1)` belongs to another basin, and `near` is kept.
@@ -130,4 +121,4 @@ def stationary_point(
     rounding = 100 * n * jnp.finfo(near.dtype).eps * bends[0]
     least = jnp.min(curvatures)
     positive = (least > rounding) & (jnp.max(curvatures) <= 2 * least)
-    return StationaryPoint(point[:n], point[n:], curvatures[0], positive)
+    return point[:n], point[n:], curvatures[0], positive

@@ -8,9 +8,8 @@ more, and the others go on: an active set (Nocedal & Wright, Numerical Optimizat
 from typing import Any
 
 import numpy as np
-from jaxtyping import Array, Float
 
-from .objective import Objective, Solved, stacked
+from .objective import Objective, Solved, stacked, Unknowns
 from .parameters import LARGEST, Transform
 
 
@@ -21,37 +20,35 @@ _NEAR, _NEXT_TO = 1e-2, 1e-3
 BESIDE = 1e-6
 
 
-def at_bounds(u: Float[Array, " N"], solved: Solved, objective: Objective) -> np.ndarray:
+def at_bounds(u: Unknowns, solved: Solved, objective: Objective) -> np.ndarray:
     """Which parameters ended at the lower (-1) or the upper bound (1), `(p,)`."""
     if objective.loss is not None or solved.matrices is None:
         return _near(u, objective.transform, _NEXT_TO)
     return driven(u, solved, objective)
 
 
-def driven(u: Float[Array, " N"], solved: Solved, objective: Objective) -> np.ndarray:
+def driven(u: Unknowns, solved: Solved, objective: Objective) -> np.ndarray:
     """Which are on a bound, or near it and would be there if the problem were linear, likewise."""
     side = _near(u, objective.transform, _NEAR)
     if objective.loss is not None or solved.matrices is None or not np.any(side):
         return np.zeros_like(side)
-    onwards = side * _linear_step(u, solved, objective)[: side.size]
+    onwards = side * linear_step(u, solved, objective)[: side.size]
     # Near a bound, the unknown is the logarithm of the distance.
     return np.where((onwards >= 0.9) | (on_bounds(u, objective.transform) != 0), side, 0)
 
 
-def on_bounds(u: Float[Array, " N"], transform: Transform) -> np.ndarray:
+def on_bounds(u: Unknowns, transform: Transform) -> np.ndarray:
     """Which have been put on a bound, likewise."""
     held = np.abs(np.asarray(u[: transform.start.size])) > LARGEST
     return np.where(held, _near(u, transform, _NEXT_TO), 0)
 
 
-def put_on_bounds(u: Float[Array, " N"], side: np.ndarray) -> Float[Array, " N"]:
+def put_on_bounds(u: Unknowns, side: np.ndarray) -> Unknowns:
     which = np.flatnonzero(side)
     return u.at[which].set(2 * LARGEST * side[which])
 
 
-def put_beside_bounds(
-    u: Float[Array, " N"], side: np.ndarray, left: Any, transform: Transform
-) -> Float[Array, " N"]:
+def put_beside_bounds(u: Unknowns, side: np.ndarray, left: Any, transform: Transform) -> Unknowns:
     """Return the unknowns with a small part `left` of the way from the start to the bound."""
     s, a, b = (np.asarray(x) for x in (transform.start, transform.lower, transform.upper))
     width = np.where(np.isfinite(b - a), b - a, 1.0)
@@ -60,28 +57,21 @@ def put_beside_bounds(
     return u.at[which].set((-side * np.log(left * other / width))[which])
 
 
-def left_if_linear(
-    u: Float[Array, " N"], side: np.ndarray, solved: Solved, objective: Objective
-) -> np.ndarray:
-    """The distances from their bounds at which the linearized problem is solved, of those now."""
-    return 1 - side * _linear_step(u, solved, objective)[: side.size]
-
-
-def _near(u: Float[Array, " N"], transform: Transform, left: float) -> np.ndarray:
+def _near(u: Unknowns, transform: Transform, left: float) -> np.ndarray:
     start = np.asarray(transform.start)
     side = np.zeros(start.shape, int)
     # The distance is at least `exp(-abs(u))` of that from the start.
     if np.all(np.abs(np.asarray(u[: start.size])) < -np.log(left)):
         return side
-    theta = np.asarray(transform.values(u[: start.size]))
+    theta = np.asarray(transform.values(u))
     for sign, bound in ((-1, np.asarray(transform.lower)), (1, np.asarray(transform.upper))):
         near = np.abs(theta - bound) <= left * np.abs(start - bound)
         side = np.where(np.isfinite(bound) & near, sign, side)
     return side
 
 
-def _linear_step(u: Any, solved: Solved, objective: Objective) -> np.ndarray:
-    """Return the step of Gauss and Newton, `(N,)`."""
+def linear_step(u: Any, solved: Solved, objective: Objective) -> np.ndarray:
+    """The step of Gauss and Newton, `(N,)`."""
     J, r = stacked(u, solved, objective)
     size = np.linalg.norm(J, axis=0)
     size[size == 0] = 1.0

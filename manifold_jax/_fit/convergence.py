@@ -4,9 +4,8 @@ from typing import Any
 
 import numpy as np
 import optimistix as optx
-from jaxtyping import Array, Float
 
-from .objective import Objective, Solved, stacked
+from .objective import Objective, Solved, stacked, Unknowns
 
 
 # What is left to a step, of what the noise of the data moves the minimum by.
@@ -27,7 +26,7 @@ def flat(losses: list[float]) -> bool:
 
 
 def at_minimum(
-    losses: list[float], u: Float[Array, " N"], solved: Solved, objective: Objective, solver: Any
+    losses: list[float], u: Unknowns, solved: Solved, objective: Objective, solver: Any
 ) -> bool:
     """Whether steps are refused at the minimum, where errors of the solves are larger than what there
     is left to gain."""

@@ -5,6 +5,8 @@ from typing import Any, NamedTuple
 import jax.tree_util as jtu
 import numpy as np
 
+from .parameters import spread
+
 
 class Records(NamedTuple):
     """`R` trajectories at `T` times each, `k` numbers observed at every time.
@@ -18,12 +20,14 @@ class Records(NamedTuple):
     weights: np.ndarray  # (R, T, k)
     t0: np.ndarray  # (R,)
     many: bool
+    absolute: bool  # whether the user knows `sigma`
+    observed: Any  # shapes of one observation
 
 
 def make_records(
     ts: Any, data: Any, sigma: Any, missing: str | None, t0: Any, observed: Any
 ) -> Records:
-    """Check and flatten; `observed` are the shapes of what is observed at one time."""
+    """Check and flatten; `observed` are the shapes of one observation."""
     if missing not in (None, "nan"):
         raise ValueError(f"`missing` must be 'nan' or None, got {missing!r}.")
     ts = np.asarray(ts, float)
@@ -44,7 +48,7 @@ def make_records(
     if sigma is None:
         size = np.sqrt(np.sum(values**2) / np.sum(known))
         weights = weights / (size if size > 0 else 1.0)
-    return Records(ts, values, weights, t0, many)
+    return Records(ts, values, weights, t0, many, sigma is not None, observed)
 
 
 def check_times(ts: Any) -> None:
@@ -82,16 +86,11 @@ def flatten(data: Any, lead: tuple[int, ...], observed: Any, name: str) -> np.nd
 
 
 def _flat_sigma(sigma: Any, lead: tuple[int, ...], data: Any, observed: Any) -> np.ndarray:
-    spread = lambda s, part: jtu.tree_map(
-        lambda leaf: np.broadcast_to(np.asarray(s, float), np.shape(leaf)), part
+    advice = (
+        "`sigma` must be a number, or have the structure of `data` with leaves that broadcast to "
+        "its shapes."
     )
-    try:
-        full = jtu.tree_map(spread, 1.0 if sigma is None else sigma, data)
-    except (ValueError, TypeError) as error:
-        raise ValueError(
-            "`sigma` must be a number, or have the structure of `data` with leaves that "
-            "broadcast to its shapes."
-        ) from error
+    full = spread(1.0 if sigma is None else sigma, data, advice)
     flat = flatten(full, lead, observed, "sigma")
     if not np.all(np.isfinite(flat) & (flat > 0)):
         raise ValueError(

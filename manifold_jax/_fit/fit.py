@@ -7,16 +7,16 @@ import diffrax as dfx
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-import optax
 import optimistix as optx
 
 from .data import check_times, make_records
-from .model import check_solver, Simulator
+from .model import as_function_of_constraint, Simulator
 from .optimize import Options
 from .parameters import make_transform
+from .pieces import make_pieces
 from .progress import Meter
 from .report import FitResult
-from .setup import check_amount, check_initial, check_options, make_objective, refuse_tracers
+from .setup import check_initial, check_options, make_objective, refuse_tracers
 from .starts import choose, draw_points, optimize_all, see, with_scales
 from .summary import summarize
 
@@ -94,11 +94,10 @@ def fit(
         tangent space. The matrices grow with the number of records.
     - `loss`: instead of squares, `loss(prediction, data, weights)` of one record, to be summed
         over records; `weights` are `1 / sigma`, and 0 where a value is missing.
-    - `optimizer`: an Optimistix least-squares solver (default: Levenberg-Marquardt) or
-        minimizer (`optx.BFGS`), or any Optax optimizer. Steps of the unknowns are
-        relative to the start values. Prefer the default, but Optax for more than about 50
-        parameters (then by reverse mode and without standard errors) or more records than can be
-        solved in each step.
+    - `optimizer`: an Optimistix least-squares solver (default: Levenberg-Marquardt) or minimizer
+        (`optx.BFGS`), or any Optax optimizer. Steps of the unknowns are relative to the start
+        values. Prefer the default, but Optax for more than about 50 parameters (then by reverse
+        mode and without standard errors) or more records than can be solved in each step.
     - `steps`: the most of them; `patience`: stop after so many without a decrease.
     - `batch_size`: with Optax, records in each step, in an order drawn with `seed`; `steps` then counts
         passes through all records.
@@ -143,33 +142,36 @@ def fit(
         model=model, parameters=parameters, ts=ts, data=data, y0=y0, sigma=sigma, states=states
     )
     check_times(ts)
-    check_solver(solver)
-    many = np.ndim(ts) == 2
+    solver = as_function_of_constraint(solver)
     transform = make_transform(parameters, bounds, positive)
-    controller = _controller(stepsize_controller)
-    simulator = Simulator(model, y0, observe, solver, controller, dt0, max_steps, many)
-    check_initial(simulator, transform, np.shape(ts))
-    first = simulator.setting(transform.unravel(transform.start), 0)
-    seen = eqx.filter_eval_shape(
-        simulator.observation, jnp.zeros(()), first.y0, transform.unravel(transform.start)
-    )
+    if stepsize_controller is None:
+        tolerance = _by_precision(1e-8, 1e-5)
+        stepsize_controller = dfx.PIDController(rtol=tolerance, atol=tolerance)
+    if optimizer is None:
+        tolerance = _by_precision(1e-7, 1e-3)
+        optimizer = optx.LevenbergMarquardt(rtol=tolerance, atol=tolerance)
+    solves = solver, stepsize_controller, dt0, max_steps
+    simulator = Simulator(model, transform, y0, observe, *solves, many=np.ndim(ts) == 2)
+    check_initial(simulator, np.shape(ts))
+    start = transform.unravel(transform.start)
+    y = simulator.given().y0
+    observed = eqx.filter_eval_shape(simulator.observation, jnp.zeros(()), y, start)
     t0 = getattr(model, "t0", None) if t0 is None and hasattr(model, "with_args") else t0
-    records = make_records(ts, data, sigma, missing, t0, seen)
-    optimizer = _default_optimizer() if optimizer is None else optimizer
-    options = Options(steps, patience, batch_size, seed, starts)
-    check_options(options, optimizer, loss, segments, records)
-    with Meter(progress) as meter:
+    records = make_records(ts, data, sigma, missing, t0, observed)
+    meter = Meter(progress)
+    options = Options(optimizer, steps, patience, batch_size, seed, starts, meter)
+    check_options(options, loss, segments, records)
+    with meter:
         with meter.compiling("the solves"):
-            by_gradient = isinstance(optimizer, optax.GradientTransformation)
-            rest = segments, states, fit_initial, loss, seen, by_gradient
-            objective = make_objective(simulator, transform, records, *rest)
+            pieces = make_pieces(records, segments, simulator, states, fit_initial)
+            objective = make_objective(simulator, records, pieces, loss, fit_initial, options)
             points = _unknowns(objective, options)
-            given = see(points[0], objective, optimizer)
-        points, losses = choose(points, given, objective, optimizer, starts, meter)
+            given = see(points[0], objective, options)
+        points, losses = choose(points, given, objective, options)
         objective = with_scales(objective, losses)
-        outcome, table = optimize_all(objective, points, losses, optimizer, options, meter)
+        outcome, table = optimize_all(objective, points, losses, options)
         with meter.compiling("the standard errors"):
-            result = summarize(objective, outcome, table, records, sigma is not None, seen)
+            result = summarize(objective, outcome, table, records)
     if throw and not result.success:
         raise RuntimeError(
             f"The fit failed: {result.message}. Start closer or several times (`starts=8`), give "
@@ -182,21 +184,19 @@ def fit(
 def _unknowns(objective: Any, options: Options) -> list[Any]:
     """Return the unknowns at all starts: those of the parameters, then those of initial states,
     which are at their guess."""
-    transform = objective.transform
-    states = objective.free.size * objective.pieces.basis.shape[-1]
-    check_amount(transform.start.size + states, objective)
-    drawn = draw_points(transform, options.starts, options.seed)
-    whole = np.concatenate([drawn, np.zeros((len(drawn), states))], axis=1)
-    return [jnp.asarray(u, transform.start.dtype) for u in whole]
+    transform, d = objective.transform, objective.pieces.basis.shape[-1]
+    states = objective.free.size * d
+    # Equations at the joints determine as many unknowns as the states there are.
+    unknowns = transform.start.size + states - objective.joints.size * d
+    values = int(jnp.sum(objective.pieces.weights > 0))
+    if values < unknowns:
+        raise ValueError(
+            f"`data` has {values} observed values for {unknowns} unknowns. Fit fewer "
+            "`parameters`, or measure more."
+        )
+    drawn = np.pad(draw_points(transform, options.starts, options.seed), ((0, 0), (0, states)))
+    return [jnp.asarray(u, transform.start.dtype) for u in drawn]
 
 
-def _default_optimizer() -> Any:
-    tolerance = 1e-7 if jnp.result_type(float) == jnp.float64 else 1e-3
-    return optx.LevenbergMarquardt(rtol=tolerance, atol=tolerance)
-
-
-def _controller(controller: Any) -> Any:
-    if controller is not None:
-        return controller
-    tolerance = 1e-8 if jnp.result_type(float) == jnp.float64 else 1e-5
-    return dfx.PIDController(rtol=tolerance, atol=tolerance)
+def _by_precision(double: float, single: float) -> float:
+    return double if jnp.result_type(float) == jnp.float64 else single

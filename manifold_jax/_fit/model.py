@@ -58,9 +58,10 @@ class Simulator(eqx.Module):
     """The user's model with all that is not fitted."""
 
     model: Any
+    transform: Transform
     y0: Any
     observe: Callable | None
-    solver: Any
+    solver: Callable  # of the constraint, which depends on the parameters
     controller: dfx.AbstractStepSizeController
     dt0: Any
     max_steps: int | None = eqx.field(static=True)
@@ -86,33 +87,30 @@ class Simulator(eqx.Module):
         args = parameters if isinstance(built, MechanicalSystem) else built.args
         return Setting(built.terms, built.constraint, y0, args)
 
-    def wrapped(self, constraint: AbstractConstraint) -> Any:
-        """The user's solver around a constraint that depends on the parameters."""
-        if isinstance(self.solver, dfx.AbstractSolver):
-            return Projected(self.solver, constraint)
-        return self.solver(constraint)
+    def given(self, record: Any = 0) -> Setting:
+        """The same with the start values of the parameters."""
+        return self.setting(self.transform.unravel(self.transform.start), record)
 
     def observation(self, t: Any, y: Y, parameters: Any) -> Any:
         return y if self.observe is None else self.observe(t, y, parameters)
 
-    def beginning(self, x: Float[Array, " q"], piece: Piece, transform: Transform) -> Setting:
+    def beginning(self, x: Float[Array, " q"], piece: Piece) -> Setting:
         """The initial value problem of one piece; `x` as for `predict`."""
-        p = transform.start.size
-        setting = self.setting(transform.parameters(x[:p]), piece.record)
+        setting = self.setting(self.transform.parameters(x), piece.record)
         base, unravel = jfu.ravel_pytree(setting.y0)
-        y0 = unravel(jnp.where(piece.first, base, piece.guess) + piece.basis @ x[p:])
+        y0 = unravel(
+            jnp.where(piece.first, base, piece.guess) + piece.basis @ x[self.transform.start.size :]
+        )
         constraint = at_start(setting.constraint, piece.start, y0, setting.args)
         return setting._replace(y0=y0, constraint=constraint)
 
-    def predict(
-        self, x: Float[Array, " q"], piece: Piece, transform: Transform, adjoint: Any
-    ) -> Prediction:
+    def predict(self, x: Float[Array, " q"], piece: Piece, adjoint: Any) -> Prediction:
         """`x`: the unknowns of the parameters, then tangent coordinates of the initial state."""
-        setting = self.beginning(x, piece, transform)
-        parameters = transform.parameters(x[: transform.start.size])
+        setting = self.beginning(x, piece)
+        parameters = self.transform.parameters(x)
         sol = diffeqsolve(
             setting.terms,
-            self.wrapped(setting.constraint),
+            self.solver(setting.constraint),
             piece.start,
             piece.ts[-1],
             self.dt0,
@@ -130,9 +128,8 @@ class Simulator(eqx.Module):
         finite = jnp.all(jnp.isfinite(states)) & jnp.all(jnp.isfinite(observed))
         failed = ~(is_okay(sol.result) & finite)
         keep = lambda values: jnp.where(failed, 0, values)
-        return Prediction(
-            keep(observed), keep(states[0]), keep(states[-1]), failed.astype(observed.dtype)
-        )
+        kept = keep(observed), keep(states[0]), keep(states[-1])
+        return Prediction(*kept, failed.astype(observed.dtype))
 
 
 def at_start(constraint: AbstractConstraint, t: Any, y: Y, args: Args) -> AbstractConstraint:
@@ -184,15 +181,18 @@ def _args_of(problem: Any, parameters: Any) -> Args:
     return problem.args._replace(**parameters)
 
 
-def check_solver(solver: Any) -> None:
+def as_function_of_constraint(solver: Any) -> Callable:
     if isinstance(solver, AbstractManifoldSolver):
         raise TypeError(
             "`solver` must not hold a constraint, as that depends on the parameters: pass the "
             "Diffrax solver inside (it is wrapped in `mj.Projected`), or "
             "`solver=lambda constraint: mj.LocalCoordinates(dfx.Tsit5(), constraint)`."
         )
-    if not isinstance(solver, dfx.AbstractSolver) and not callable(solver):
+    if isinstance(solver, dfx.AbstractSolver):
+        return eqx.Partial(Projected, solver)
+    if not callable(solver):
         raise TypeError(
             "`solver` must be a Diffrax solver or a function of the constraint that returns a "
             f"solver, got {type(solver).__name__}."
         )
+    return solver

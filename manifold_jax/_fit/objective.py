@@ -1,7 +1,7 @@
 """Residuals and losses of all pieces, and their derivatives."""
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import diffrax as dfx
 import equinox as eqx
@@ -17,6 +17,9 @@ from .model import Piece, Prediction, Simulator
 from .parameters import Transform
 
 
+Unknowns: TypeAlias = Float[Array, " N"]
+
+
 class Objective(eqx.Module):
     """Everything that the unknowns are compared with.
 
@@ -30,7 +33,6 @@ class Objective(eqx.Module):
     """
 
     simulator: Simulator
-    transform: Transform
     pieces: Piece
     free: Any
     joints: Any
@@ -39,10 +41,13 @@ class Objective(eqx.Module):
     penalty: Any
     loss: Callable | None
     unravel: Callable = eqx.field(static=True)
-    records: int = eqx.field(static=True)
     reverse: bool = eqx.field(static=True)
 
-    def chosen(self, u: Float[Array, " N"], batch: Any = None) -> tuple[Any, Piece]:
+    @property
+    def transform(self) -> Transform:
+        return self.simulator.transform
+
+    def chosen(self, u: Unknowns, batch: Any = None) -> tuple[Any, Piece]:
         """The unknowns of each piece, `(pieces, p + d)`, and the pieces: all, or some."""
         p, d = self.transform.start.size, self.pieces.basis.shape[-1]
         z = jnp.zeros((self.pieces.start.size, d), u.dtype)
@@ -60,25 +65,22 @@ class Solved(NamedTuple):
     values: Prediction
     matrices: Prediction | None
 
-    def around(self, u: Float[Array, " N"], objective: Objective, batch: Any = None) -> Prediction:
+    def around(self, u: Unknowns, objective: Objective, batch: Any = None) -> Prediction:
         """The predictions as a function of `u` that can be differentiated (once)."""
         x, _ = objective.chosen(u, batch)
         step = x - jax.lax.stop_gradient(x)
-        return jtu.tree_map(
-            lambda v, M: v + jax.vmap(jnp.matmul)(M, step), self.values, self.matrices
-        )
+        moved = lambda v, M: v + jax.vmap(jnp.matmul)(M, step)
+        return jtu.tree_map(moved, self.values, self.matrices)
 
 
-def solve(u: Float[Array, " N"], objective: Objective, batch: Any = None) -> Solved:
+def solve(u: Unknowns, objective: Objective, batch: Any = None) -> Solved:
     """Solve all pieces, or those of a batch. Failed ones give zeros, so that none of their
-    values gets into a derivative. No derivatives of many unknowns (`reverse`)."""
+    values gets into a derivative."""
     x, pieces = objective.chosen(jax.lax.stop_gradient(u), batch)
-    if objective.reverse:
-        return Solved(_backwards_all(objective, x, pieces), None)
 
     def one(x: Any, piece: Piece) -> Solved:
         def twice(x: Any) -> Any:
-            out = objective.simulator.predict(x, piece, objective.transform, dfx.ForwardMode())
+            out = objective.simulator.predict(x, piece, dfx.ForwardMode())
             return out, out
 
         matrices, out = jax.jacfwd(twice, has_aux=True)(x)
@@ -92,8 +94,7 @@ def solve(u: Float[Array, " N"], objective: Objective, batch: Any = None) -> Sol
 
 def _each(function: Callable, x: Any, pieces: Piece) -> Any:
     """Evaluate a function for every piece. A batch of one alone takes half as long again to trace,
-    and both branches of
-    every condition to run."""
+    and both branches of every condition to run."""
     if x.shape[0] > 1:
         return jax.vmap(function)(x, pieces)
     one = function(*jtu.tree_map(lambda leaf: leaf[0], (x, pieces)))
@@ -101,8 +102,7 @@ def _each(function: Callable, x: Any, pieces: Piece) -> Any:
 
 
 def gaps(objective: Objective, predicted: Prediction) -> Float[Array, "joints d"]:
-    """Return the gaps from the end of a piece to the start of the next, along the manifold
-    there."""
+    """The gaps from the end of a piece to the start of the next, along the manifold there."""
     j = objective.joints
     jump = predicted.end[j] - predicted.begin[j + 1]
     gap = jnp.sum(objective.pieces.basis[j + 1] * jump[:, :, None], axis=1)
@@ -129,15 +129,14 @@ class Linearized(NamedTuple):
 
 
 @eqx.filter_jit
-def linearize(u: Float[Array, " N"], solved: Solved, objective: Objective) -> Linearized:
+def linearize(u: Unknowns, solved: Solved, objective: Objective) -> Linearized:
     def both(u: Any) -> Any:
         predicted = solved.around(u, objective)
         out = weighted(objective, predicted), gaps(objective, predicted)
         return out, out
 
     (J, C), (r, c) = jax.jacfwd(both, has_aux=True)(u)
-    values, p = objective.transform.values, objective.transform.start.size
-    slopes = jax.jvp(values, (u[:p],), (jnp.ones_like(u[:p]),))[1]
+    slopes = jax.jvp(objective.transform.values, (u,), (jnp.ones_like(u),))[1]
     return Linearized(r, J, c, C, slopes)
 
 
@@ -150,7 +149,7 @@ def stacked(u: Any, solved: Solved, objective: Objective) -> tuple[np.ndarray, n
     return J, np.concatenate([linear.r.ravel(), gaps.ravel()])
 
 
-def residuals(u: Float[Array, " N"], objective: Objective) -> tuple[Any, Any]:
+def residuals(u: Unknowns, objective: Objective) -> tuple[Any, Any]:
     """Return the residuals for least-squares solvers: of the data and of the joints; then the loss
     and all pieces."""
     solved = solve(u, objective)
@@ -160,14 +159,13 @@ def residuals(u: Float[Array, " N"], objective: Objective) -> tuple[Any, Any]:
     return (r, c), (0.5 * (jnp.sum(r * r) + jnp.sum(c * c)), solved)
 
 
-def total_loss(
-    u: Float[Array, " N"], objective: Objective, batch: Any = None
-) -> tuple[FloatScalar, Any]:
+def total_loss(u: Unknowns, objective: Objective, batch: Any = None) -> tuple[FloatScalar, Any]:
     """Return the loss for minimizers: the sum over all records, or the mean over those of a batch;
     then as above."""
     x, pieces = objective.chosen(u, batch)
     if objective.reverse:
-        predicted = _backwards_all(objective, x, pieces)
+        one = lambda x, piece: _backwards(x, (piece, objective.simulator))
+        predicted = _each(one, x, pieces)
         solved = Solved(predicted, None)
     else:
         solved = solve(u, objective, batch)
@@ -194,24 +192,18 @@ def _own_loss(objective: Objective, observed: Any, data: Any, weights: Any) -> F
     return loss
 
 
-def _backwards_all(objective: Objective, x: Any, pieces: Piece) -> Prediction:
-    rest = objective.simulator, objective.transform
-    return _each(lambda x, piece: _backwards(x, (piece, *rest)), x, pieces)
-
-
 @eqx.filter_custom_vjp
 def _backwards(x: Any, rest: Any) -> Prediction:
     """Differentiate for many unknowns: one sweep backwards instead of one forwards for each."""
-    piece, simulator, transform = rest
-    return simulator.predict(x, piece, transform, StepReplayAdjoint())
+    piece, simulator = rest
+    return simulator.predict(x, piece, StepReplayAdjoint())
 
 
 @_backwards.def_fwd
 def _backwards_fwd(perturbed: Any, x: Any, rest: Any) -> Any:
     del perturbed
-    piece, simulator, transform = rest
-    adjoint = StepReplayAdjoint()
-    out, pullback = jax.vjp(lambda x: simulator.predict(x, piece, transform, adjoint), x)
+    piece, simulator = rest
+    out, pullback = jax.vjp(lambda x: simulator.predict(x, piece, StepReplayAdjoint()), x)
     return out, (pullback, out)
 
 

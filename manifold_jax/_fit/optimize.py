@@ -10,20 +10,26 @@ import numpy as np
 import optax
 import optimistix as optx
 
-from .bounds import BESIDE, driven, left_if_linear, on_bounds, put_beside_bounds, put_on_bounds
+from .bounds import BESIDE, driven, linear_step, on_bounds, put_beside_bounds, put_on_bounds
 from .convergence import at_minimum, flat, stalled
 from .objective import gaps, Objective, residuals, Solved, total_loss
 from .progress import Meter
 
 
 class Options(NamedTuple):
-    """How long to go on, how often to start, and in which order."""
+    """By what, how long and how often to optimize, in which order, and where to say how far it is."""
 
+    optimizer: Any
     steps: int
     patience: int
     batch_size: int | None
     seed: int
     starts: int
+    meter: Meter
+
+    @property
+    def by_gradient(self) -> bool:
+        return isinstance(self.optimizer, optax.GradientTransformation)
 
 
 class Outcome(NamedTuple):
@@ -37,49 +43,48 @@ class Outcome(NamedTuple):
     message: str
 
 
-def look(u: Any, objective: Objective, optimizer: Any) -> tuple[Any, Solved]:
+def look(u: Any, objective: Objective, options: Options) -> tuple[Any, Solved]:
     """The loss and all pieces at one point, by the program that takes steps if it can tell:
     compiling takes longer than solving."""
-    if isinstance(optimizer, optax.GradientTransformation):
+    if options.by_gradient:
         return _loss(u, objective)[1]
-    return _advance(optimizer, u, objective, _initialize(optimizer, u, objective))[2]
+    state = _initialize(options.optimizer, u, objective)
+    return _advance(options.optimizer, u, objective, state)[2]
 
 
 _loss = eqx.filter_jit(total_loss)
 
 
-def optimize(
-    objective: Objective, u: Any, optimizer: Any, options: Options, meter: Meter
-) -> Outcome:
-    if isinstance(optimizer, optax.GradientTransformation):
-        return _with_optax(objective, u, optimizer, options, meter)
+def optimize(objective: Objective, u: Any, options: Options) -> Outcome:
+    if options.by_gradient:
+        return _with_optax(objective, u, options)
     if objective.joints.size == 0:
-        return _within_bounds(objective, u, optimizer, options, meter)
-    return _closing_gaps(objective, u, optimizer, options, meter)
+        return _within_bounds(objective, u, options)
+    return _closing_gaps(objective, u, options)
 
 
-def _within_bounds(
-    objective: Objective, u: Any, solver: Any, options: Options, meter: Meter
-) -> Outcome:
+def _within_bounds(objective: Objective, u: Any, options: Options) -> Outcome:
     """Each parameter is put on a bound at most once, and at most once taken off again, if it belongs
     inside after the others have moved."""
     transform = objective.transform
     losses, movable = [], np.ones(transform.start.size, bool)
     returning = movable.copy()
     while True:
-        found = _with_optimistix(objective, u, solver, options, meter, losses, movable)
+        found = _with_optimistix(objective, u, options, losses, movable)
         side = driven(found.u, found.solved, objective) * movable
         if np.any(side):
             movable &= side == 0
             there = put_on_bounds(found.u, side)
-            loss, _ = look(there, objective, solver)
+            loss, _ = look(there, objective, options)
             u = there if float(loss) <= losses[-1] else found.u
             continue
         side = on_bounds(found.u, transform)
         if not found.success or not np.any(side):
             return found
         beside = put_beside_bounds(found.u, side, BESIDE, transform)
-        left = left_if_linear(beside, side, look(beside, objective, solver)[1], objective)
+        step = linear_step(beside, look(beside, objective, options)[1], objective)
+        # of the distances now, those at which the linearized problem is solved
+        left = 1 - side * step[: side.size]
         inside = (side != 0) & (left > 2) & returning
         if not np.any(inside):
             return found
@@ -89,21 +94,16 @@ def _within_bounds(
 
 
 def _with_optimistix(
-    objective: Objective,
-    u: Any,
-    solver: Any,
-    options: Options,
-    meter: Meter,
-    losses: list[float],
-    movable: np.ndarray,
+    objective: Objective, u: Any, options: Options, losses: list[float], movable: np.ndarray
 ) -> Outcome:
     """Step by step through the public methods of the solver, which return what was seen at the
     point from which they step. Ends early where a `movable` parameter is driven to a bound."""
-    state, done, okay, message = _initialize(solver, u, objective), False, True, None
+    solver, done, okay, message = options.optimizer, False, True, None
+    state = _initialize(solver, u, objective)
     while message is None:
         new, state, (loss, solved), new_done, new_okay = _advance(solver, u, objective, state)
         losses.append(float(loss))
-        meter.advance(losses[-1])
+        options.meter.advance(losses[-1])
         if not okay:
             message = "a linear solve of the optimizer failed"
         elif done or stalled(losses, options.patience):
@@ -139,9 +139,7 @@ def _advance(solver: Any, u: Any, objective: Objective, state: Any) -> Any:
     return u, state, seen, done, result == optx.RESULTS.successful
 
 
-def _closing_gaps(
-    objective: Objective, u: Any, solver: Any, options: Options, meter: Meter
-) -> Outcome:
+def _closing_gaps(objective: Objective, u: Any, options: Options) -> Outcome:
     """Multiple shooting: the states at the joints meet in the limit.
 
     An augmented Lagrangian, `sum r^2 + w^2 sum (c + s)^2`: after each fit `s` grows by the gaps
@@ -149,7 +147,7 @@ def _closing_gaps(
     """
     losses = []
     for _ in range(12):
-        found = _within_bounds(objective, u, solver, options, meter)
+        found = _within_bounds(objective, u, options)
         u, losses = found.u, losses + found.losses
         gap = gaps(objective, found.solved.values)
         size = float(jnp.max(jnp.abs(gap)))
@@ -165,13 +163,11 @@ def _closing_gaps(
     return found._replace(losses=losses, loss=np.inf, success=False, message=message)
 
 
-def _with_optax(
-    objective: Objective, u: Any, optimizer: Any, options: Options, meter: Meter
-) -> Outcome:
+def _with_optax(objective: Objective, u: Any, options: Options) -> Outcome:
     """Epochs of one batch each, or of a random order of all records cut into batches."""
     records, size = objective.pieces.start.size, options.batch_size
     random = np.random.default_rng(options.seed)
-    optimizer = optax.with_extra_args_support(optimizer)
+    optimizer = optax.with_extra_args_support(options.optimizer)
     state, losses, best = optimizer.init(u), [], (np.inf, u)
     message = f"all {options.steps} steps taken"
     for _ in range(options.steps):
@@ -181,16 +177,16 @@ def _with_optax(
         begin, total = u, 0.0
         for batch in batches:
             batch = None if batch is None else jnp.asarray(batch)
-            with meter.compiling("a step"):
+            with options.meter.compiling("a step"):
                 u, state, loss = _descend(optimizer, u, state, objective, batch)
             total += float(loss) / len(batches)
         losses.append(total)
-        meter.advance(total)
+        options.meter.advance(total)
         best = min(best, (total, begin if size is None else u), key=lambda pair: pair[0])
         if stalled(losses, options.patience):
             message = "the loss decreases no more"
             break
-    solved = look(best[1], objective, optimizer)[1]
+    solved = look(best[1], objective, options)[1]
     return Outcome(best[1], solved, losses, best[0], True, message)
 
 

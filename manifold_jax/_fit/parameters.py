@@ -30,7 +30,9 @@ class Transform(eqx.Module):
     names: tuple[str, ...] = eqx.field(static=True)
     unravel: Any = eqx.field(static=True)
 
-    def values(self, u: Float[Array, " p"]) -> Float[Array, " p"]:
+    def values(self, u: Float[Array, " N"]) -> Float[Array, " p"]:
+        """`theta` of the first `p` of all unknowns of a fit."""
+        u = u[: self.start.size]
         s, has_a, has_b = self.start, jnp.isfinite(self.lower), jnp.isfinite(self.upper)
         # Selected twice, as the derivative of a discarded infinity would be NaN.
         a, b = jnp.where(has_a, self.lower, s - 1), jnp.where(has_b, self.upper, s + 1)
@@ -41,7 +43,7 @@ class Transform(eqx.Module):
         between = a + (b - a) / (1 + jnp.exp(-(v + middle)))
         return jnp.where(has_a, jnp.where(has_b, between, above), jnp.where(has_b, below, free))
 
-    def parameters(self, u: Float[Array, " p"]) -> Any:
+    def parameters(self, u: Float[Array, " N"]) -> Any:
         return self.unravel(self.values(u))
 
 
@@ -91,18 +93,22 @@ def _flat_bounds(parameters: Any, bounds: Any) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _flat_prefix(prefix: Any, tree: Any, name: str, what: str) -> np.ndarray:
-    """A value for each number in `tree`, from a tree whose leaves hold for whole parts."""
-    spread = lambda value, part: jtu.tree_map(
-        lambda leaf: np.broadcast_to(np.asarray(value, float), leaf.shape), part
+    advice = (
+        f"`{name}` must be {what}, or have the structure and shapes of `parameters`, "
+        f"{jtu.tree_structure(tree)}."
+    )
+    return np.concatenate(list(map(np.ravel, jtu.tree_leaves(spread(prefix, tree, advice)))))
+
+
+def spread(prefix: Any, tree: Any, advice: str) -> Any:
+    """Numbers like those in `tree`, from a tree whose leaves hold for whole parts of it."""
+    fill = lambda value, part: jtu.tree_map(
+        lambda leaf: np.broadcast_to(np.asarray(value, float), np.shape(leaf)), part
     )
     try:
-        full = jtu.tree_map(spread, prefix, tree)
+        return jtu.tree_map(fill, prefix, tree)
     except (ValueError, TypeError) as error:
-        raise ValueError(
-            f"`{name}` must be {what}, or have the structure and shapes of `parameters`, "
-            f"{jtu.tree_structure(tree)}."
-        ) from error
-    return np.concatenate([np.ravel(leaf) for leaf in jtu.tree_leaves(full)])
+        raise ValueError(advice) from error
 
 
 def _entries(path: Any, shape: tuple[int, ...]) -> list[str]:

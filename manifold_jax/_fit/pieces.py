@@ -7,6 +7,7 @@ import diffrax as dfx
 import jax
 import jax.flatten_util as jfu
 import jax.numpy as jnp
+import jax.tree_util as jtu
 import numpy as np
 
 from .._constraint.checks import check_constraint
@@ -14,16 +15,10 @@ from .._constraint.constraint import Invariants
 from .._constraint.residual import jacobian, residual_vector
 from .data import filled_in_time, flatten, Records
 from .model import at_start, Piece, Simulator
-from .parameters import Transform
 
 
 def make_pieces(
-    records: Records,
-    segments: int,
-    simulator: Simulator,
-    transform: Transform,
-    states: Any,
-    free_start: bool,
+    records: Records, segments: int, simulator: Simulator, states: Any, free_start: bool
 ) -> Piece:
     """Pieces of all records, those of one record next to each other.
 
@@ -43,19 +38,14 @@ def make_pieces(
     first = np.arange(segments) == 0
     start = np.where(first, records.t0[:, None], records.ts[:, edges[:-1]])
     weights = records.weights[:, index] * own[None, :, :, None]
-    guess = _guess(records, edges, simulator, transform, states)
-    basis = _charts(simulator, transform, start, guess, needed=free_start or segments > 1)
+    guess = _guess(records, edges, simulator, states)
+    basis = _charts(simulator, start, guess, needed=free_start or segments > 1)
+    parts = dict(ts=records.ts[:, index], data=records.data[:, index], weights=weights)
+    parts |= dict(start=start, guess=guess, basis=basis)
     merge = lambda a: jnp.asarray(a.reshape(R * segments, *a.shape[2:]), float)
-    return Piece(
-        merge(start),
-        merge(records.ts[:, index]),
-        merge(records.data[:, index]),
-        merge(weights),
-        merge(guess),
-        merge(basis),
-        jnp.asarray(np.tile(first, R)),
-        jnp.asarray(np.repeat(np.arange(R), segments)),
-    )
+    record = jnp.asarray(np.repeat(np.arange(R), segments))
+    first = jnp.asarray(np.tile(first, R))
+    return Piece(**jtu.tree_map(merge, parts), first=first, record=record)
 
 
 def edges_of(times: int, segments: int) -> np.ndarray:
@@ -63,41 +53,33 @@ def edges_of(times: int, segments: int) -> np.ndarray:
     return np.round(np.linspace(0, times - 1, segments + 1)).astype(int)
 
 
-def _guess(
-    records: Records, edges: np.ndarray, simulator: Simulator, transform: Transform, states: Any
-) -> np.ndarray:
+def _guess(records: Records, edges: np.ndarray, simulator: Simulator, states: Any) -> np.ndarray:
     """States at the starts of all pieces, `(R, S, n)`: given, measured, or simulated."""
-    y0 = simulator.setting(transform.unravel(transform.start), 0).y0
-    first = _starts(records, simulator, transform)[:, None]
+    one = lambda r: jfu.ravel_pytree(simulator.given(r).y0)[0]
+    first = jax.vmap(one)(jnp.arange(records.ts.shape[0]))[:, None]
     if edges.size == 2:
         return np.asarray(first)
     if states is not None:
         lead = records.ts.shape if records.many else records.ts.shape[1:]
-        later = flatten(states, lead, y0, "states").reshape(*records.ts.shape, -1)
+        later = flatten(states, lead, simulator.given().y0, "states").reshape(*records.ts.shape, -1)
         if not np.all(np.isfinite(later)):
             raise ValueError("`states` must be finite: guesses of the states at all of `ts`.")
     elif simulator.observe is None:
         later = filled_in_time(records)
     else:
-        later = _simulate(records, simulator, transform)
+        later = _simulate(records, simulator, first[:, 0])
     return np.concatenate([first, later[:, edges[1:-1]]], axis=1)
 
 
-def _starts(records: Records, simulator: Simulator, transform: Transform) -> Any:
-    parameters = transform.unravel(transform.start)
-    one = lambda r: jfu.ravel_pytree(simulator.setting(parameters, r).y0)[0]
-    return jax.vmap(one)(jnp.arange(records.ts.shape[0]))
-
-
-def _simulate(records: Records, simulator: Simulator, transform: Transform) -> np.ndarray:
+def _simulate(records: Records, simulator: Simulator, y0: Any) -> np.ndarray:
     """Trajectories with the start values of the parameters, for want of a better guess."""
-    whole, y0 = dataclasses.replace(simulator, observe=None), _starts(records, simulator, transform)
+    whole = dataclasses.replace(simulator, observe=None)
     (R, T), n = records.ts.shape, y0.shape[1]
     empty, first = jnp.zeros((R, T, 0)), jnp.ones(R, bool)
     times = jnp.asarray(records.t0), jnp.asarray(records.ts)
     pieces = Piece(*times, empty, empty, y0, jnp.zeros((R, n, 0)), first, jnp.arange(R))
-    u, adjoint = jnp.zeros_like(transform.start), dfx.ForwardMode()
-    predicted = jax.vmap(lambda piece: whole.predict(u, piece, transform, adjoint))(pieces)
+    u, adjoint = jnp.zeros_like(simulator.transform.start), dfx.ForwardMode()
+    predicted = jax.vmap(lambda piece: whole.predict(u, piece, adjoint))(pieces)
     if np.any(predicted.failed):
         raise ValueError(
             f"`parameters`: the solve of record {np.argmax(predicted.failed)} from the start values "
@@ -106,17 +88,14 @@ def _simulate(records: Records, simulator: Simulator, transform: Transform) -> n
     return np.asarray(predicted.observed)
 
 
-def _charts(
-    simulator: Simulator, transform: Transform, start: np.ndarray, guess: np.ndarray, needed: bool
-) -> np.ndarray:
+def _charts(simulator: Simulator, start: np.ndarray, guess: np.ndarray, needed: bool) -> np.ndarray:
     """Orthonormal bases of the tangent spaces at all guesses, `(R, S, n, d)`.
 
     `d` is the dimension of the manifold, of the whole space for conserved quantities, whose
     values belong to the initial state. Without unknown states `d = 0`.
     """
     R, S, n = guess.shape
-    parameters = transform.unravel(transform.start)
-    setting = simulator.setting(parameters, 0)
+    setting = simulator.given()
     check_constraint(setting.constraint, start[0, 0], setting.y0, setting.args)
     if not needed:
         return np.zeros((R, S, n, 0))

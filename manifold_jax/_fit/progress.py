@@ -44,8 +44,7 @@ class Meter:
 
     def begin(self, name: str, steps: int, listed: bool = False) -> None:
         """`listed`: whether its end stays on a terminal, too."""
-        self.name, self.listed, self.count = name, listed, 0
-        self.steps = steps
+        self.name, self.steps, self.listed, self.count = name, steps, listed, 0
         self.bar.reset(self.task, total=steps, description=name, loss="")
 
     def advance(self, loss: float) -> None:
@@ -54,8 +53,7 @@ class Meter:
         now = time.perf_counter()
         if now - self.last >= max(1.0, 0.1 * (now - self.begun)):
             self.last = now
-            seconds = now - self.begun
-            text = f"{self.name}: step {self.count}, loss {loss:.6g}, {seconds:.0f} s"
+            text = f"{self.name}: step {self.count}, loss {loss:.6g}, {now - self.begun:.0f} s"
             self._line(text, self.in_lines)
 
     def end(self, loss: float, message: str) -> None:

@@ -1,38 +1,40 @@
-"""How well the model fits the data, and how well they determine its parameters."""
+"""How well the model fits the data, and how well they determine its parameters: standard errors from the
+Gauss-Newton matrix."""
 
 from typing import Any, NamedTuple
 
 import jax.tree_util as jtu
 import numpy as np
+import scipy.linalg
 
 from .bounds import at_bounds
 from .data import Records
 from .objective import linearize, Objective, Solved, weighted
-from .uncertainty import describe, gauss_newton
+
+
+# Derivatives are as accurate as the solver's tolerance; singular values below this fraction of
+# the largest, after columns are scaled to length 1, are not told from zero.
+_SINGULAR = 1e-6
 
 
 class Quality(NamedTuple):
-    """`None` where it cannot be told: with a `loss` of one's own, or without data to spare.
-
-    `chi_squared` needs a `sigma` that is known, `covariance` derivatives. `at_bounds` has -1 for a
-    parameter at its lower bound and 1 at the upper, `(p,)`."""
+    """What [`FitResult`][] says, likewise. `None` where it cannot be told: with a `loss` of one's own, or
+    without data to spare."""
 
     covariance: np.ndarray | None
     noise: float | None
     chi_squared: float | None
     degrees_of_freedom: int | None
     unidentifiable: tuple[str, ...]
-    at_bounds: np.ndarray
+    at_bounds: tuple[str, ...]
 
 
-def judge(
-    u: Any, solved: Solved, objective: Objective, records: Records, absolute: bool
-) -> Quality:
-    """Judge a fit from the residuals of records that were solved; `absolute`: whether `sigma` is
-    known."""
+def judge(u: Any, solved: Solved, objective: Objective, records: Records) -> Quality:
+    """Judge a fit from the residuals of records that were solved."""
     side = at_bounds(u, solved, objective)
+    names = tuple(name for name, s in zip(objective.transform.names, side, strict=True) if s)
     if objective.loss is not None:
-        return Quality(None, None, None, None, (), side)
+        return Quality(None, None, None, None, (), names)
     failed = np.asarray(solved.values.failed) > 0
     used = (np.asarray(objective.pieces.weights) > 0) & ~failed[:, None, None]
     squares = float(np.sum(np.asarray(weighted(objective, solved.values))[used] ** 2))
@@ -43,12 +45,12 @@ def judge(
         covariance, rank, lines = _determined(u, solved, objective, used, free)
     freedom = int(np.sum(used)) - rank
     if freedom <= 0:
-        return Quality(covariance if absolute else None, None, None, None, lines, side)
+        return Quality(covariance if records.absolute else None, None, None, None, lines, names)
     noise = np.sqrt(squares / freedom)
-    if absolute:
-        return Quality(covariance, float(noise), squares, freedom, lines, side)
+    if records.absolute:
+        return Quality(covariance, float(noise), squares, freedom, lines, names)
     scaled = None if covariance is None else noise**2 * covariance
-    return Quality(scaled, float(noise / np.max(records.weights)), None, None, lines, side)
+    return Quality(scaled, float(noise / np.max(records.weights)), None, None, lines, names)
 
 
 def _determined(
@@ -71,3 +73,66 @@ def _determined(
     covariance = np.full((p, p), np.nan)
     covariance[np.ix_(own, own)] = block
     return covariance, found.rank, tuple(lines)
+
+
+class Uncertainty(NamedTuple):
+    """Covariance `(N, N)` for noise of size 1, of how many unknowns the data tell, and a basis of the
+    directions along which nothing changes, `(directions, N)`, each of few unknowns."""
+
+    covariance: np.ndarray
+    rank: int
+    directions: np.ndarray
+
+
+def gauss_newton(J: np.ndarray, C: np.ndarray) -> Uncertainty:
+    r"""Covariance of a linear least-squares fit, `(J^T J)^-1` on the null space of `C`.
+
+    `J` are the derivatives of the weighted residuals, `C` those of equations that hold exactly (the
+    gaps of multiple shooting). With `Z` a basis of the null space of `C`, it is
+    `Z (Z^T J^T J Z)^-1 Z^T`, from the singular values of `J Z`.
+
+    Source: Seber & Wild, Nonlinear Regression (1989), sections 2.1 and 5.13.
+    """
+    size = np.linalg.norm(np.concatenate([J, C]), axis=0)
+    dead = size <= _SINGULAR * np.max(size, initial=0.0)
+    scale = 1 / np.where(dead, 1.0, size)
+    J, C = np.where(dead, 0.0, J * scale), np.where(dead, 0.0, C * scale)
+    Z = scipy.linalg.null_space(C, rcond=1e-12) if C.size else np.eye(J.shape[1])
+    # The triangle has the same singular values, and the size of the unknowns only.
+    _, s, Vt = np.linalg.svd(np.linalg.qr(J @ Z, mode="r"), full_matrices=True)
+    s = np.concatenate([s, np.zeros(Vt.shape[0] - s.size)])
+    small = s <= _SINGULAR * np.max(s, initial=0.0)
+    root = (Z @ Vt.T[:, ~small]) / s[~small] * scale[:, None]
+    directions = (Z @ Vt.T[:, small]).T * scale
+    return Uncertainty(root @ root.T, int(np.sum(~small)), _sparse(directions))
+
+
+def _sparse(directions: np.ndarray) -> np.ndarray:
+    """Another basis, in which each vector has one unknown for itself: Gauss-Jordan elimination."""
+    count = directions.shape[0]
+    if count == 0:
+        return directions
+    R, order = scipy.linalg.qr(directions, mode="r", pivoting=True)  # pyright: ignore[reportAssignmentType]
+    return np.linalg.solve(R[:, :count], R)[:, np.argsort(order)]  # pyright: ignore[reportArgumentType, reportCallIssue]
+
+
+def describe(
+    direction: np.ndarray, slopes: np.ndarray, names: np.ndarray
+) -> tuple[str, np.ndarray]:
+    """A line for the report, and which of the `p` parameters are involved.
+
+    Involved are those that change by a twentieth of the largest change; numbers are changes of the
+    parameters in their own units (`slopes`: by their unknowns), the largest of them 1."""
+    p, size = len(names), np.max(np.abs(direction))
+    involved = np.abs(direction[:p]) > 0.05 * size
+    change = direction[:p] * np.where(involved, slopes, 0.0)
+    largest = change[np.argmax(np.abs(change))] if p else 0.0
+    # A fit that has diverged may be where unknowns change their parameters by nothing, or by infinity.
+    told = largest != 0 and np.isfinite(largest)
+    parts = [
+        f"{names[i]} ({change[i] / largest:+.3g})" if told else str(names[i])
+        for i in np.flatnonzero(involved)
+    ]
+    if np.any(np.abs(direction[p:]) > 0.05 * size):
+        parts.append("initial states")
+    return " with ".join(parts), involved

@@ -1,5 +1,6 @@
 """The result of a fit: parameters, how well they fit and are determined, a text and a picture."""
 
+import itertools
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -176,18 +177,13 @@ class FitResult(eqx.Module):
 
     def _curves(self) -> Any:
         """Up to eight components over time, of the first record and then of others."""
-        many = np.ndim(self.ts) == 2
         ts = np.atleast_2d(self.ts)
-        shape = lambda leaf: np.reshape(leaf, (*ts.shape, -1))
-        leaves = zip(*map(jtu.tree_leaves, (self.prediction, self.residuals)), strict=True)
-        parts = [(shape(a), shape(b)) for a, b in leaves]
-        found = [
-            (ts[r], a[r, :, k], b[r, :, k])
-            for r in range(len(ts) if many else 1)
-            for a, b in parts
-            for k in range(a.shape[2])  # pyright: ignore[reportGeneralTypeIssues]
-        ]
-        return found[:8]
+        flat = lambda tree: np.concatenate(
+            [np.reshape(leaf, (*ts.shape, -1)) for leaf in jtu.tree_leaves(tree)], axis=2
+        )
+        prediction, residuals = flat(self.prediction), flat(self.residuals)
+        places = itertools.islice(np.ndindex(len(ts), prediction.shape[2]), 8)
+        return [(ts[r], prediction[r, :, k], residuals[r, :, k]) for r, k in places]
 
 
 def _flat(tree: Any) -> np.ndarray:

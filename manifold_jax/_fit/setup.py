@@ -8,15 +8,12 @@ import jax.flatten_util as jfu
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-import optax
 import optimistix as optx
 
 from .data import Records
-from .model import Simulator
+from .model import Piece, Simulator
 from .objective import Objective
 from .optimize import Options
-from .parameters import Transform
-from .pieces import make_pieces
 
 
 # Unknowns of one trajectory beyond which one reverse sweep is cheaper than a forward sweep for each.
@@ -37,8 +34,8 @@ def refuse_tracers(**given: Any) -> None:
             )
 
 
-def check_initial(simulator: Simulator, transform: Transform, grid: tuple[int, ...]) -> None:
-    y0 = simulator.y0
+def check_initial(simulator: Simulator, grid: tuple[int, ...]) -> None:
+    y0, transform = simulator.y0, simulator.transform
     y0 = y0(transform.unravel(transform.start)) if callable(y0) else y0
     if y0 is None or not simulator.many:
         return
@@ -50,10 +47,8 @@ def check_initial(simulator: Simulator, transform: Transform, grid: tuple[int, .
             )
 
 
-def check_options(
-    options: Options, optimizer: Any, loss: Any, segments: Any, records: Records
-) -> None:
-    by_gradient = isinstance(optimizer, optax.GradientTransformation)
+def check_options(options: Options, loss: Any, segments: Any, records: Records) -> None:
+    optimizer, by_gradient = options.optimizer, options.by_gradient
     squares = isinstance(optimizer, optx.AbstractLeastSquaresSolver)
     if not by_gradient and not squares and not isinstance(optimizer, optx.AbstractMinimiser):
         raise TypeError(
@@ -85,51 +80,34 @@ def check_options(
         )
 
 
-def check_amount(unknowns: int, objective: Objective) -> None:
-    """Equations at the joints determine as many unknowns as the states there are."""
-    joints = objective.joints.size * objective.pieces.basis.shape[-1]
-    values = int(jnp.sum(objective.pieces.weights > 0))
-    if values < unknowns - joints:
-        raise ValueError(
-            f"`data` has {values} observed values for {unknowns - joints} unknowns. Fit fewer "
-            "`parameters`, or measure more."
-        )
-
-
 def make_objective(
-    simulator: Any,
-    transform: Transform,
+    simulator: Simulator,
     records: Records,
-    segments: int,
-    states: Any,
-    fit_initial: bool,
+    pieces: Piece,
     loss: Any,
-    seen: Any,
-    by_gradient: bool,
+    fit_initial: bool,
+    options: Options,
 ) -> Objective:
-    pieces = make_pieces(records, segments, simulator, transform, states, fit_initial)
-    reverse = by_gradient and transform.start.size + pieces.basis.shape[-1] > _MANY_UNKNOWNS
+    unknowns, d = simulator.transform.start.size, pieces.basis.shape[-1]
     first = np.asarray(pieces.first)
     free = np.flatnonzero(~first | fit_initial)
     joints = np.flatnonzero(~np.roll(first, -1))
     # A gap counts as much as a residual of the same relative size.
-    known = records.weights[records.weights > 0]
-    size = np.sqrt(np.mean(records.data[records.weights > 0] ** 2))
+    known = records.weights > 0
+    size = np.sqrt(np.mean(records.data[known] ** 2))
     states = np.sqrt(np.mean(np.asarray(pieces.guess) ** 2))
-    stiffness = np.sqrt(np.mean(known**2)) * size / states if states > 0 else 1.0
-    zeros = jtu.tree_map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), seen)
-    dtype = transform.start.dtype
+    scale = np.sqrt(np.mean(records.weights[known] ** 2)) * size
+    dtype = simulator.transform.start.dtype
+    zeros = jtu.tree_map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), records.observed)
     return Objective(
-        simulator,
-        transform,
-        pieces,
-        jnp.asarray(free),
-        jnp.asarray(joints),
-        jnp.asarray(stiffness, dtype),
-        jnp.zeros((joints.size, pieces.basis.shape[-1]), dtype),
-        jnp.ones((), dtype),
-        loss,
-        jfu.ravel_pytree(zeros)[1],
-        records.ts.shape[0],
-        reverse,
+        simulator=simulator,
+        pieces=pieces,
+        free=jnp.asarray(free),
+        joints=jnp.asarray(joints),
+        stiffness=jnp.asarray(scale / states if states > 0 else 1.0, dtype),
+        shift=jnp.zeros((joints.size, d), dtype),
+        penalty=jnp.ones((), dtype),
+        loss=loss,
+        unravel=jfu.ravel_pytree(zeros)[1],
+        reverse=options.by_gradient and unknowns + d > _MANY_UNKNOWNS,
     )

@@ -10,7 +10,6 @@ import numpy as np
 from .objective import Objective, weighted
 from .optimize import look, optimize, Options, Outcome
 from .parameters import Transform
-from .progress import Meter
 from .report import Start
 from .setup import refuse_tracers
 
@@ -50,8 +49,8 @@ def draw_points(transform: Transform, starts: int, seed: int) -> np.ndarray:
     return np.concatenate([given, np.where(both, within, around)])
 
 
-def see(u: Any, objective: Objective, optimizer: Any) -> Seen:
-    loss, solved = look(u, objective, optimizer)
+def see(u: Any, objective: Objective, options: Options) -> Seen:
+    loss, solved = look(u, objective, options)
     refuse_tracers(model=loss)
     failed = np.asarray(solved.values.failed) > 0
     r = np.abs(np.asarray(weighted(objective, solved.values))[~failed])
@@ -59,19 +58,19 @@ def see(u: Any, objective: Objective, optimizer: Any) -> Seen:
 
 
 def choose(
-    points: list[Any], given: Seen, objective: Objective, optimizer: Any, starts: int, meter: Meter
+    points: list[Any], given: Seen, objective: Objective, options: Options
 ) -> tuple[list[Any], list[Seen]]:
     """The given start, the first of `points`, and of the others those with the fewest failures, then
     with the lowest losses."""
     seen = [given]
-    if starts > 1:
-        meter.begin("fit: looking for starts", len(points) - 1)
+    if options.starts > 1:
+        options.meter.begin("fit: looking for starts", len(points) - 1)
     for u in points[1:]:
-        seen.append(see(u, objective, optimizer))
-        meter.advance(seen[-1].loss)
+        seen.append(see(u, objective, options))
+        options.meter.advance(seen[-1].loss)
     usable = [i for i, at in enumerate(seen) if i > 0 and not np.all(at.failed)]
     others = sorted(usable, key=lambda i: (np.sum(seen[i].failed), seen[i].loss))
-    best = [0, *others[: starts - 1]]
+    best = [0, *others[: options.starts - 1]]
     return [points[i] for i in best], [seen[i] for i in best]
 
 
@@ -90,26 +89,20 @@ def with_scales(objective: Objective, seen: list[Seen]) -> Objective:
 
 
 def optimize_all(
-    objective: Objective,
-    points: list[Any],
-    seen: list[Seen],
-    optimizer: Any,
-    options: Options,
-    meter: Meter,
+    objective: Objective, points: list[Any], seen: list[Seen], options: Options
 ) -> tuple[Outcome, tuple[Start, ...]]:
     """One after the other by the same compiled program, as compiling takes longer than a few fits.
     The best, and a table of all with the best first."""
     best, rows, several = None, [], len(points) > 1
-    p, transform = objective.transform.start.size, objective.transform
-    like = lambda u: jtu.tree_map(np.asarray, transform.parameters(u[:p]))
+    like = lambda u: jtu.tree_map(np.asarray, objective.transform.parameters(u))
     for number, (u, at) in enumerate(zip(points, seen, strict=True), 1):
         if np.all(at.failed):
             rows.append(Start(like(u), like(u), np.inf, 0, False, "every solve fails"))
             continue
         name = f"fit: start {number} of {len(points)}" if several else "fit"
-        meter.begin(name, options.steps, listed=several)
-        found = optimize(objective, u, optimizer, options, meter)
-        meter.end(found.loss, found.message)
+        options.meter.begin(name, options.steps, listed=several)
+        found = optimize(objective, u, options)
+        options.meter.end(found.loss, found.message)
         steps = len(found.losses)
         rows.append(Start(like(u), like(found.u), found.loss, steps, found.success, found.message))
         if best is None or _better(found, best):

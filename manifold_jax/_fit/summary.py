@@ -19,62 +19,49 @@ from .report import FitResult, Start
 
 
 def summarize(
-    objective: Objective,
-    outcome: Outcome,
-    starts: tuple[Start, ...],
-    records: Records,
-    absolute: bool,
-    seen: Any,
+    objective: Objective, outcome: Outcome, starts: tuple[Start, ...], records: Records
 ) -> FitResult:
-    """`absolute`: whether the user knows `sigma`; `seen`: shapes of one observation."""
     u, transform = outcome.u, objective.transform
     observed, *_, failed = jtu.tree_map(np.asarray, outcome.solved.values)
-    failed = failed > 0
-    bad = np.any(failed.reshape(records.ts.shape[0], -1), axis=1)
-    theta = np.asarray(transform.values(u[: transform.start.size]))
-    quality = judge(u, outcome.solved, objective, records, absolute)
+    bad = np.any(failed.reshape(records.ts.shape[0], -1) > 0, axis=1)
+    theta = np.asarray(transform.values(u))
+    quality = judge(u, outcome.solved, objective, records)
     prediction = _on_grid(observed, records)
     deviation = np.where(records.weights > 0, prediction - records.data, np.nan)
     prediction[bad], deviation[bad] = np.nan, np.nan
     lead = (lambda a: a) if records.many else (lambda a: a[0])
     like = lambda flat: jtu.tree_map(np.asarray, transform.unravel(jnp.asarray(flat)))
-    y0 = jtu.tree_map(lambda leaf: lead(np.asarray(leaf)), _initial_states(u, objective))
-    covariance, sides = quality.covariance, zip(transform.names, quality.at_bounds, strict=True)
-    spread = None if covariance is None else like(np.sqrt(np.diag(covariance)))
+    first = np.flatnonzero(objective.pieces.first)
+    y0 = jtu.tree_map(lambda a: lead(np.asarray(a)[first]), _initial_states(u, objective))
+    covariance = quality.covariance
     return FitResult(
         parameters=like(theta),
-        standard_errors=spread,
-        covariance=covariance,
+        standard_errors=None if covariance is None else like(np.sqrt(np.diag(covariance))),
         names=transform.names,
         y0=y0,
-        noise=quality.noise,
-        chi_squared=quality.chi_squared,
-        degrees_of_freedom=quality.degrees_of_freedom,
         ts=lead(records.ts),
-        prediction=unflatten(lead(prediction), seen),
-        residuals=unflatten(lead(deviation), seen),
+        prediction=unflatten(lead(prediction), records.observed),
+        residuals=unflatten(lead(deviation), records.observed),
         history=np.asarray(outcome.losses),
         failed=bad,
-        unidentifiable=quality.unidentifiable,
-        at_bounds=tuple(name for name, side in sides if side),
         starts=starts,
         success=outcome.success and bool(np.all(np.isfinite(theta))),
         message=outcome.message,
+        **quality._asdict(),
     )
 
 
 @eqx.filter_jit
 def _initial_states(u: Any, objective: Objective) -> Any:
-    """Return the initial states of all records, on the manifold."""
+    """The states at the starts of all pieces, on the manifold."""
     x, pieces = objective.chosen(u)
 
     def one(x: Any, piece: Any) -> Any:
-        begin = objective.simulator.beginning(x, piece, objective.transform)
+        begin = objective.simulator.beginning(x, piece)
         y0, _ = consistent_state(begin.constraint, piece.start, begin.y0, begin.args, throw=False)
         return y0
 
-    count = pieces.start.size // objective.records
-    return jtu.tree_map(lambda leaf: leaf[::count], jax.vmap(one)(x, pieces))
+    return jax.vmap(one)(x, pieces)
 
 
 def _on_grid(observed: np.ndarray, records: Records) -> np.ndarray:

@@ -4,23 +4,23 @@ from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from .._base.types import Args, RealScalarLike
 from .._mechanics import MechanicalSystem
-from . import reading
 from .bodies import Bodies, Body, Pose
-from .checks import check_vector, floating
-from .drives import group_restraints
+from .checks import check_shape, floating
+from .equations import DRIVEN
 from .forces import AbstractForce
 from .frames import Frames, in_space
-from .joint_groups import jacobian, JointGroup, residuals
-from .joints import AbstractRestraint
-from .load_groups import group_forces
-from .loads import AbstractLoads, add
-from .rotations import rates_matrix, turn_back
+from .joint_groups import group_restraints, JointGroup, reactions, residuals
+from .joints import AbstractRestraint, Revolute
+from .loads import AbstractLoads, group_forces
+from .reading import Energy, JointForce, Motion, over_times, Times
+from .rotations import rates_matrix, turn
 from .start import make_state
 from .system import ConstantAssembly, system_of
 
@@ -79,7 +79,7 @@ class Assembly(eqx.Module):
         self.joints = group_restraints(self.bodies, joints)
         self.loads = group_forces(self.bodies, self.joints, forces)
         gravity = np.zeros(d) if gravity is None else gravity
-        self.gravity = in_space(check_vector("`gravity`", gravity, d))
+        self.gravity = in_space(check_shape("`gravity`", gravity, (d,)))
         self.redundant = redundant
         if self.bodies.planar and not self.joints:
             raise ValueError(
@@ -139,67 +139,78 @@ class Assembly(eqx.Module):
     ) -> dict[str, Float[Array, " r"]]:
         """Residuals of the joints by name at the first part of a state `(q, v)`: lengths in metres,
         cosines of angles. `t` and `args` are those of [`Drive`][]s, whose angles are in rad."""
-        gaps = residuals(self.joints_at(t, args), q)
-        pairs = [
-            (name, row)
-            for group, rows in zip(self.joints, gaps, strict=True)
-            for name, row in zip(group.attachment.names, rows, strict=True)
-        ]
-        return dict(pairs)
+        rows = (row for part in residuals(self.joints_at(t, args), q) for row in part)
+        return dict(zip(self.joint_names, rows, strict=True))
 
-    def motion(self, y: tuple[Pose, Pose], name: str) -> reading.Motion:
+    @over_times
+    def motion(self, y: tuple[Pose, Pose], name: str) -> Motion:
         """Position, orientation, velocity and angular velocity of a body. `y` may have leading axes,
         here and below, such as `sol.ys`."""
-        return reading.motion(self, y, name)
+        i = self.bodies.moving_index(name, "`motion`")
+        q, v = y
+        spin = Frames.of(q, v).spin[i]
+        spin = spin[2] if q.planar else spin
+        return Motion(q.position[i], q.orientation[i], v.position[i], spin)
 
+    @over_times
     def point(self, y: tuple[Pose, Pose], name: str, at: Any) -> tuple[Array, Array]:
         """Position and velocity in space of the point `at` in the frame of a body."""
-        return reading.point(self, y, name, at)
+        d = 2 if self.bodies.planar else 3
+        i = self.bodies.index(name, "`point`")
+        at = check_shape("`at`", at, (d,))
+        frames = Frames.of(*y)
+        arm = frames.rotation[i][:, :d] @ at
+        velocity = frames.velocity[i] + jnp.cross(frames.spin[i], arm)
+        return (frames.origin[i] + arm)[:d], velocity[:d]
 
+    @over_times
     def joint_coordinates(self, y: tuple[Pose, Pose]) -> dict[str, Float[Array, "*t"]]:
         """Angles of hinges (from `-pi` to `pi`) and displacements of sliders by name, zero in the
         drawing."""
-        return reading.joint_coordinates(self, y)
+        frames, found = Frames.of(*y), {}
+        for group in self.joints:
+            if group.kind in DRIVEN and group.motions is None:
+                values = group.attachment.sides(frames).coordinate(group.kind is Revolute)
+                found |= dict(zip(group.attachment.names, values, strict=True))
+        return found
 
     def joint_forces(
-        self, t: reading.Times, y: tuple[Pose, Pose], args: Args = None
-    ) -> dict[str, reading.JointForce]:
+        self, t: Times, y: tuple[Pose, Pose], args: Args = None
+    ) -> dict[str, JointForce]:
         """Force and torque of every joint on its second body, from the multipliers, at the time `t` or
-        the times of all states. With `redundant`
-        joints it is the sum over those that depend on each other that is determined."""
-        return reading.joint_forces(self, t, y, args)
+        the times of all states. With `redundant` joints it is the sum over those that depend on each
+        other that is determined."""
+        if y[0].position.ndim > 2:
+            times = jnp.broadcast_to(floating(t), y[0].position.shape[:1])
+            return jax.vmap(lambda t, y: self.joint_forces(t, y, args))(times, y)
+        multipliers, frames = self.system.multipliers(t, y, args), Frames.of(*y)
+        found, start = {}, 0
+        for group in self.joints_at(t, args):
+            k, r = group.residual(group.attachment.sides(frames)).shape
+            own = multipliers[start : start + k * r].reshape(k, r)
+            start += k * r
+            forces, torques = reactions(group, frames, own)
+            if self.bodies.planar:
+                forces, torques = forces[:, :2], torques[:, 2]
+            on_second = map(JointForce, forces, torques)
+            found |= dict(zip(group.attachment.names, on_second, strict=True))
+        return found
 
-    def energy(self, y: tuple[Pose, Pose]) -> reading.Energy:
+    @over_times
+    def energy(self, y: tuple[Pose, Pose]) -> Energy:
         """Kinetic energy, and potential energy of weight and springs."""
-        return reading.energy(self, y)
+        q, v = y
+        bodies, frames = self.bodies, Frames.of(q, v)
+        moving = jnp.sum(bodies.mass[:, None] * v.position**2)
+        if bodies.planar:
+            turning = jnp.sum(bodies.inertia * v.orientation**2)
+        else:
+            spin = 2 * turn(rates_matrix(q.orientation), v.orientation)
+            turning = jnp.sum(spin * turn(bodies.inertia, spin))
+        weight = -jnp.sum(bodies.mass * (frames.origin[:-1] @ self.gravity))
+        stored = sum((loads.potential(frames) for loads in self.loads), weight)
+        return Energy((moving + turning) / 2, stored)
 
     def joints_at(self, t: RealScalarLike, args: Args) -> tuple[JointGroup, ...]:
         """Return the joints with the motions of drives at that time."""
         return tuple(group.at(t, args) for group in self.joints)
-
-    def _equations(self, t: RealScalarLike, q: Pose, args: Args) -> tuple[Array, ...]:
-        equations = residuals(self.joints_at(t, args), q)
-        if self.bodies.planar:
-            return equations
-        return (*equations, (jnp.sum(q.orientation**2, axis=1) - 1) / 2)
-
-    def _jacobian(self, t: RealScalarLike, q: Pose, args: Args) -> Float[Array, "m n"]:
-        rows = jacobian(self.joints_at(t, args), q)
-        if not self.bodies.planar:
-            p, own = q.orientation, jnp.eye(len(self.names), dtype=rows.dtype)
-            norms = own[:, :, None] * jnp.pad(p, ((0, 0), (3, 0)))[:, None, :]
-            rows = jnp.concatenate([rows, norms])
-        return rows.reshape(rows.shape[0], -1)
-
-    def _force(self, t: RealScalarLike, q: Pose, v: Pose, args: Args) -> Pose:
-        frames = Frames.of(q, v)
-        weight = self.bodies.mass[:, None] * self.gravity[None, :]
-        total = jnp.pad(weight, ((0, 1), (0, 0))), jnp.zeros_like(frames.origin)
-        for loads in self.loads:
-            total = add(total, loads.wrench(t, frames, args))
-        force, torque = total[0][:-1], total[1][:-1]
-        if self.bodies.planar:
-            return Pose(force[:, :2], torque[:, 2])
-        local = turn_back(frames.rotation[:-1], torque)
-        turning = 2 * turn_back(rates_matrix(q.orientation), local)
-        return Pose(force, turning + self.bodies.gyroscopic(q, v))

@@ -1,6 +1,6 @@
 """Where joints and forces are attached: points and orthonormal frames in their two bodies."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -12,20 +12,20 @@ from jaxtyping import Array, Float
 from . import joints
 from .bodies import Bodies, Pose
 from .checks import check_sequence, stack, unique_names
-from .frames import Frames, in_space, Placed, with_ground
+from .frames import Frames, in_space, Placed, Vectors, with_ground
 from .rotations import basis, compose, dot, turn, turn_back
 
 
 class Sides(NamedTuple):
     """Points and frames of `k` joints in space, of their first and of their second bodies."""
 
-    first: Float[Array, "k 3"]
-    second: Float[Array, "k 3"]
+    first: Vectors
+    second: Vectors
     frame_first: Float[Array, "k 3 3"]
     frame_second: Float[Array, "k 3 3"]
 
     @property
-    def gap(self) -> Float[Array, "k 3"]:
+    def gap(self) -> Vectors:
         return self.second - self.first
 
     def cosine(self, i: int, j: int) -> Float[Array, " k"]:
@@ -40,6 +40,9 @@ class Sides(NamedTuple):
     def angle(self) -> Float[Array, " k"]:
         """About the third axis, zero in the drawing, from `-pi` to `pi`."""
         return jnp.arctan2(self.cosine(1, 0), self.cosine(0, 0))
+
+    def coordinate(self, hinge: bool) -> Float[Array, " k"]:
+        return self.angle if hinge else self.along(2)
 
 
 class Attachment(eqx.Module):
@@ -64,7 +67,7 @@ class Attachment(eqx.Module):
         axes = compose(placed.rotation, self.axes)
         return Sides(at[0], at[1], axes[0], axes[1])
 
-    def velocities(self, frames: Frames, sides: Sides) -> Float[Array, "k 3"]:
+    def velocities(self, frames: Frames, sides: Sides) -> Vectors:
         """Return the velocities of the second points against the first."""
         arms = jnp.stack([sides.first, sides.second]) - frames.origin[self.index]
         moving = frames.velocity[self.index] + jnp.cross(frames.spin[self.index], arms)
@@ -75,50 +78,43 @@ def attach(
     bodies: Bodies, things: Sequence[Any], names: Sequence[str], axes: Sequence[Any] | None = None
 ) -> Attachment:
     """Points and frames of the drawing in the frames of the bodies; `axes` are pairs."""
-    first, second = zip(
-        *[_indices(bodies, t, name) for t, name in zip(things, names, strict=True)], strict=True
-    )
-    pairs = [_ends(bodies, t, i, name) for t, i, name in zip(things, first, names, strict=True)]
-    is_drawn = np.array([pair[0] for pair in pairs])
-    given = stack([stack([pair[side] for pair in pairs]) for side in (1, 2)])
-    upright = np.array([0.0, 0.0, 1.0])
-    axes = [(upright, upright)] * len(things) if axes is None else axes
-    given_axes = stack([stack([pair[side] for pair in axes]) for side in (0, 1)])
-    index = first, second
-    points, frames = _in_bodies(bodies.drawing, np.asarray(index), given, is_drawn, given_axes)
-    return Attachment(tuple(names), index, points, frames)
+    placed = [_ends(bodies, thing, name) for thing, name in zip(things, names, strict=True)]
+    index, is_drawn, ends = zip(*placed, strict=True)
+    axes = [joints.UPRIGHT] * len(things) if axes is None else axes
+    of_sides = lambda pairs: stack([stack(side) for side in zip(*pairs, strict=True)])
+    first, second = zip(*index, strict=True)
+    given = np.array(is_drawn), of_sides(ends), of_sides(axes)
+    points, frames = _in_bodies(bodies.drawing, np.array((first, second)), *given)
+    return Attachment(tuple(names), (first, second), points, frames)
 
 
 @jax.jit  # one program, not one for each operation
 def _in_bodies(
-    drawing: Pose, index: Any, given: Array, is_drawn: Any, axes: Array
+    drawing: Pose, index: Any, is_drawn: Any, given: Array, axes: Array
 ) -> tuple[Float[Array, "2 k 3"], Float[Array, "2 k 3 3"]]:
-    origin, rotation = Placed.of_rows(with_ground(drawing)[index], drawing.planar)
+    origin, rotation = Placed.of(with_ground(drawing.coordinates)[index])
     given = in_space(given)
     in_body = turn_back(rotation, given - origin)
     frames = compose(jnp.swapaxes(rotation, -1, -2), basis(axes))
     return jnp.where(is_drawn[None, :, None], in_body, given), frames
 
 
-def _ends(bodies: Bodies, thing: Any, first: int, name: str) -> tuple[bool, Any, Any]:
-    if isinstance(thing, joints.Fixed) and thing.at is None and thing.points is None:
-        if first == len(bodies.names):
-            first = bodies.index(thing.second, name)
-        at = bodies.drawing.position[first]
-        return True, at, at
-    return joints.ends(thing, name, bodies.planar)
-
-
-def _indices(bodies: Bodies, thing: Any, name: str) -> tuple[int, int]:
+def _ends(bodies: Bodies, thing: Any, name: str) -> tuple[tuple[int, int], bool, tuple[Any, Any]]:
+    """The bodies of a joint or a force; whether its points are those of the drawing, and the points."""
     if thing.first == thing.second:
         raise ValueError(
             f"{name} connects {thing.first!r} with itself. Give two bodies, or `mj.multibody.GROUND`."
         )
-    return bodies.index(thing.first, name), bodies.index(thing.second, name)
+    index = bodies.index(thing.first, name), bodies.index(thing.second, name)
+    if isinstance(thing, joints.Fixed) and thing.at is None and thing.points is None:
+        moving = index[1] if index[0] == len(bodies.names) else index[0]
+        at = bodies.drawing.position[moving]
+        return index, True, (at, at)
+    return index, *joints.ends(thing, name, bodies.planar)
 
 
-def name_all(given: Any, base: type, what: str) -> tuple[list[Any], tuple[str, ...]]:
-    """All joints or forces and their names, those that have none made of kind and bodies."""
+def name_all(given: Any, base: type, what: str) -> list[tuple[Any, str]]:
+    """All joints or forces with their names, those that have none made of kind and bodies."""
     things = check_sequence(f"{what}s", given, base, f"{what}s of `mj.multibody`")
     names, count = [], {}
     for thing in things:
@@ -129,4 +125,12 @@ def name_all(given: Any, base: type, what: str) -> tuple[list[Any], tuple[str, .
             count[name] = count.get(name, 0) + 1
             name = name if count[name] == 1 else f"{name} ({count[name]})"
         names.append(name)
-    return things, unique_names(what, names)
+    return list(zip(things, unique_names(what, names), strict=True))
+
+
+def grouped(things: Iterable[tuple], kind: Callable) -> dict[type, zip]:
+    """Of every `kind(*thing)`, in the order in which these come first, the parts of all its things."""
+    groups: dict[type, list[tuple]] = {}
+    for thing in things:
+        groups.setdefault(kind(*thing), []).append(thing)
+    return {kind: zip(*own, strict=True) for kind, own in groups.items()}

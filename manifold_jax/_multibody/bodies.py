@@ -9,15 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._mechanics import InvertedBlocks
-from .checks import (
-    check_number,
-    check_sequence,
-    check_shape,
-    check_vector,
-    is_concrete,
-    stack,
-    unique_names,
-)
+from .checks import check_sequence, check_shape, is_concrete, stack, unique_names
 from .rotations import compose, inverted, rates_matrix, turn
 
 
@@ -88,14 +80,14 @@ class Body(eqx.Module):
             )
         self.name = name
         what = f"Body {name!r}"
-        self.mass = check_number(f"{what}: `mass`", mass)
+        self.mass = check_shape(f"{what}: `mass`", mass, ())
         self.inertia = check_shape(
             f"{what}: `inertia`", inertia, (), (3,), (3, 3), advice=" (a number in the plane)"
         )
         planar = self.inertia.ndim == 0
         d, still = (2, 0.0) if planar else (3, (1.0, 0.0, 0.0, 0.0))
         where = np.zeros(d) if position is None else position
-        self.position = check_vector(f"{what}: `position`", where, d)
+        self.position = check_shape(f"{what}: `position`", where, (d,))
         turned = still if orientation is None else orientation
         self.orientation = check_orientation(f"{what}: `orientation`", turned, planar)
         _check_mass(self)

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.core
 import jax.numpy as jnp
@@ -13,26 +14,32 @@ from .._base.types import Args, RealScalarLike
 from .._base.user_functions import check_function
 
 
-def check_value(word: str, value: Any, name: str, shape: tuple[int, ...]) -> Any:
-    """Return the value of the argument `word` of the thing called `name`."""
-    if callable(value):
-        check_function(f"{word}` of `{name}", value, "f(t, args)")
-        return value
-    return check_shape(f"{name}: `{word}`", value, shape)
+class Values(eqx.Module):
+    """What every one of several joints or forces has as its argument `word`: numbers or arrays of one
+    shape, or functions `f(t, args)` that return them."""
 
+    word: str = eqx.field(static=True)
+    names: tuple[str, ...] = eqx.field(static=True)
+    shape: tuple[int, ...] = eqx.field(static=True)
+    given: tuple
 
-def evaluate(
-    word: str,
-    values: tuple,
-    t: RealScalarLike,
-    args: Args,
-    shape: tuple[int, ...],
-    names: tuple[str, ...],
-) -> Array:
-    """All in one array `(k, *shape)`."""
-    pairs = zip(values, names, strict=True)
-    given = ((value(t, args) if callable(value) else value, name) for value, name in pairs)
-    return stack([check_shape(f"{name}: `{word}`", value, shape) for value, name in given])
+    def __init__(
+        self, word: str, names: tuple[str, ...], shape: tuple[int, ...], given: Sequence[Any]
+    ):
+        self.word, self.names, self.shape = word, names, shape
+        for value, name in zip(given, names, strict=True):
+            if callable(value):
+                check_function(f"{word}` of `{name}", value, "f(t, args)")
+        pairs = zip(given, names, strict=True)
+        self.given = tuple(v if callable(v) else self._checked(v, name) for v, name in pairs)
+
+    def at(self, t: RealScalarLike, args: Args) -> Array:
+        """All in one array `(k, *shape)`."""
+        found = (value(t, args) if callable(value) else value for value in self.given)
+        return stack(list(map(self._checked, found, self.names)))
+
+    def _checked(self, value: Any, name: str) -> Array:
+        return check_shape(f"{name}: `{self.word}`", value, self.shape)
 
 
 def floating(value: Any) -> Array:
@@ -44,6 +51,11 @@ def floating(value: Any) -> Array:
 
 def is_concrete(value: Any) -> bool:
     return not isinstance(value, jax.core.Tracer)
+
+
+def on_host(value: Any) -> Any:
+    """Concrete arrays in NumPy, where taking them apart starts no program."""
+    return np.asarray(value) if is_concrete(value) else value
 
 
 def check_shape(what: str, value: Any, *shapes: tuple[int, ...], advice: str = "") -> Array:
@@ -60,23 +72,15 @@ def check_shape(what: str, value: Any, *shapes: tuple[int, ...], advice: str = "
     return array
 
 
-def check_number(what: str, value: Any) -> Array:
-    return check_shape(what, value, ())
-
-
-def check_vector(what: str, value: Any, size: int) -> Array:
-    return check_shape(what, value, (size,))
-
-
-def stack(values: Sequence[Any]) -> Array:
+def stack(values: Sequence[Any], axis: int = 0) -> Array:
     """One array; of concrete values without a program for each."""
     if all(is_concrete(value) for value in values):
-        return jnp.asarray(np.stack([np.asarray(value) for value in values]))
-    return jnp.stack([jnp.asarray(value) for value in values])
+        return jnp.asarray(np.stack([np.asarray(value) for value in values], axis))
+    return jnp.stack([jnp.asarray(value) for value in values], axis)
 
 
 def check_axis(what: str, value: Any) -> Array:
-    axis = check_vector(what, value, 3)
+    axis = check_shape(what, value, (3,))
     if is_concrete(axis) and not np.linalg.norm(axis) > 0:
         raise ValueError(f"{what} is zero: an axis needs a direction.")
     return axis

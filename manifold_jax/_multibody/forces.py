@@ -3,19 +3,9 @@
 A `value` is a number or array, or a function `f(t, args)` of the time and the `args` of the solve.
 """
 
-import abc
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
-
-
-class SpringLaw(NamedTuple):
-    """`stiffness (x - rest) + damping x' - value` against a coordinate `x`."""
-
-    stiffness: Any = 0.0
-    rest: Any = 0.0
-    damping: Any = 0.0
-    value: Any = 0.0
 
 
 class AbstractForce(eqx.Module):
@@ -25,30 +15,20 @@ class AbstractForce(eqx.Module):
 
 
 class AbstractLineForce(AbstractForce):
-    """Between two points, whose distance is the coordinate."""
+    """A force between two points, along their line: they attract each other with
+    `stiffness (l - length) + damping l' - value`, `l` their distance, as far as it has these."""
 
-    first: eqx.AbstractVar[str]
-    second: eqx.AbstractVar[str]
+    first: str = eqx.field(static=True)
+    second: str = eqx.field(static=True)
     between: eqx.AbstractVar[Any]
     points: eqx.AbstractVar[Any]
 
-    @property
-    def drawn(self) -> Any:
-        return self.between
-
-    @property
-    @abc.abstractmethod
-    def law(self) -> SpringLaw: ...
-
 
 class AbstractJointForce(AbstractForce):
-    """A force in a hinge or slider, against its coordinate."""
+    """A force in a hinge or slider: against its coordinate `x` acts
+    `stiffness (x - rest) + damping x' - value`, as far as it has these."""
 
-    joint: eqx.AbstractVar[str]
-
-    @property
-    @abc.abstractmethod
-    def law(self) -> SpringLaw: ...
+    joint: str = eqx.field(static=True)
 
 
 class Spring(AbstractLineForce):
@@ -67,8 +47,6 @@ class Spring(AbstractLineForce):
         of the bodies.
     """
 
-    first: str = eqx.field(static=True)
-    second: str = eqx.field(static=True)
     stiffness: Any = 0.0
     length: Any = 0.0
     damping: Any = 0.0
@@ -76,41 +54,25 @@ class Spring(AbstractLineForce):
     points: Any = None
     name: str | None = eqx.field(static=True, default=None)
 
-    @property
-    def law(self):
-        return SpringLaw(self.stiffness, self.length, self.damping)
-
 
 class Damper(AbstractLineForce):
     """A damper between two points: they attract each other with `damping l'`. Arguments as for
     [`Spring`][]."""
 
-    first: str = eqx.field(static=True)
-    second: str = eqx.field(static=True)
     damping: Any = 0.0
     between: Any = None
     points: Any = None
     name: str | None = eqx.field(static=True, default=None)
-
-    @property
-    def law(self):
-        return SpringLaw(damping=self.damping)
 
 
 class LinearActuator(AbstractLineForce):
     """A cylinder between two points that pushes them apart with the force `value` (N), a number or
     `f(t, args)`. Other arguments as for [`Spring`][]."""
 
-    first: str = eqx.field(static=True)
-    second: str = eqx.field(static=True)
     value: Any
     between: Any = None
     points: Any = None
     name: str | None = eqx.field(static=True, default=None)
-
-    @property
-    def law(self):
-        return SpringLaw(value=self.value)
 
 
 class JointSpring(AbstractJointForce):
@@ -125,15 +87,10 @@ class JointSpring(AbstractJointForce):
     - `stiffness` (N m/rad or N/m), `rest` (rad or m), `damping` (N m s/rad or N s/m).
     """
 
-    joint: str = eqx.field(static=True)
     stiffness: Any = 0.0
     rest: Any = 0.0
     damping: Any = 0.0
     name: str | None = eqx.field(static=True, default=None)
-
-    @property
-    def law(self):
-        return SpringLaw(self.stiffness, self.rest, self.damping)
 
 
 class Motor(AbstractJointForce):
@@ -143,13 +100,8 @@ class Motor(AbstractJointForce):
     **Arguments:** `joint` as for [`JointSpring`][]; `value`.
     """
 
-    joint: str = eqx.field(static=True)
     value: Any
     name: str | None = eqx.field(static=True, default=None)
-
-    @property
-    def law(self):
-        return SpringLaw(value=self.value)
 
 
 class Force(AbstractForce):

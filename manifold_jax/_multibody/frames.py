@@ -1,6 +1,6 @@
 """Where the bodies are in space, and how they move: origins and rotation matrices of their frames."""
 
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -11,6 +11,9 @@ from .bodies import Pose
 from .rotations import planar_rotation, rates_matrix, rotation_matrix, turn
 
 
+Vectors: TypeAlias = Float[Array, "k 3"]  # one for each of several joints or forces
+
+
 class Placed(NamedTuple):
     """Where the frames of bodies are in space; those in the plane are turned about the third axis."""
 
@@ -18,22 +21,18 @@ class Placed(NamedTuple):
     rotation: Float[Array, "*n 3 3"]
 
     @staticmethod
-    def of(q: Pose) -> "Placed":
-        turned = planar_rotation if q.planar else rotation_matrix
-        return Placed(in_space(q.position), turned(q.orientation))
-
-    @staticmethod
-    def of_rows(rows: Float[Array, "*n c"], planar: bool) -> "Placed":
-        """Make frames from rows of coordinates."""
-        d = 2 if planar else 3
-        return Placed.of(Pose(rows[..., :d], rows[..., 2] if planar else rows[..., 3:]))
+    def of(rows: Float[Array, "*n c"]) -> "Placed":
+        """Make frames from the coordinates of a [`Pose`][]."""
+        if rows.shape[-1] == 3:
+            return Placed(in_space(rows[..., :2]), planar_rotation(rows[..., 2]))
+        return Placed(rows[..., :3], rotation_matrix(rows[..., 3:]))
 
 
-def with_ground(q: Pose) -> Float[Array, "n_and_1 c"]:
-    """A row of coordinates for each body and, last, for the ground."""
-    upright = np.zeros((1, q.coordinates.shape[-1]))
+def with_ground(rows: Float[Array, "n c"]) -> Float[Array, "n_and_1 c"]:
+    """The coordinates of bodies and, last, of the ground."""
+    upright = np.zeros((1, rows.shape[-1]))
     upright[0, 3:4] = 1  # of a quaternion
-    return jnp.concatenate([q.coordinates, jnp.asarray(upright, q.coordinates.dtype)])
+    return jnp.concatenate([rows, jnp.asarray(upright, rows.dtype)])
 
 
 class Frames(NamedTuple):
@@ -47,17 +46,14 @@ class Frames(NamedTuple):
 
     @staticmethod
     def of(q: Pose, v: Pose) -> "Frames":
-        n = q.position.shape[0]
-        origin, rotation = Placed.of(q)
+        rows = with_ground(q.coordinates)
+        origin, rotation = Placed.of(rows)
+        rates = jnp.pad(v.coordinates, ((0, 1), (0, 0)))
         if q.planar:
-            spin = jnp.stack([jnp.zeros(n, v.orientation.dtype)] * 2 + [v.orientation], axis=1)
-        else:
-            spin = turn(rotation, 2 * turn(rates_matrix(q.orientation), v.orientation))
-        ground = jnp.eye(3, dtype=rotation.dtype)[None]
-        still = lambda rows: jnp.concatenate([in_space(rows), jnp.zeros((1, 3), rows.dtype)])
-        return Frames(
-            still(origin), jnp.concatenate([rotation, ground]), still(v.position), still(spin)
-        )
+            spin = jnp.pad(rates[:, 2:], ((0, 0), (2, 0)))
+            return Frames(origin, rotation, in_space(rates[:, :2]), spin)
+        spin = turn(rotation, 2 * turn(rates_matrix(rows[:, 3:]), rates[:, 3:]))
+        return Frames(origin, rotation, rates[:, :3], spin)
 
 
 @jax.jit

@@ -1,7 +1,7 @@
-"""The joints of an assembly, those of one kind together: residuals, Jacobian, and what they transmit."""
+"""The joints of an assembly and the drives of some, those of one kind together: residuals, Jacobian, and
+what they transmit."""
 
 import dataclasses
-from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -12,11 +12,11 @@ from jaxtyping import Array, Float
 
 from .._base.types import Args, RealScalarLike
 from . import joints
-from .attachment import attach, Attachment
+from .attachment import attach, Attachment, grouped, name_all, Sides
 from .bodies import Bodies, Pose
-from .checks import check_number, evaluate, is_concrete, stack
+from .checks import check_shape, is_concrete, on_host, stack, Values
 from .equations import DRIVEN, PLANAR, SPATIAL
-from .frames import Frames, Placed, with_ground
+from .frames import Frames, Placed, Vectors, with_ground
 from .rotations import length_of
 
 
@@ -27,88 +27,95 @@ class JointGroup(eqx.Module):
     planar: bool = eqx.field(static=True)
     attachment: Attachment
     length: Float[Array, " k"]  # of rods; of drives where their joints have to be
-    motions: tuple | None = None
+    motions: Values | None = None
 
-    @staticmethod
-    def of(kind: type, bodies: Bodies, things: list[Any], names: list[str]) -> "JointGroup":
-        planar = bodies.planar
-        if kind not in (PLANAR if planar else SPATIAL):
-            known = ", ".join(k.__name__ for k in (PLANAR if planar else SPATIAL))
-            where = "the plane" if planar else "space"
-            raise ValueError(f"{names[0]}: joints in {where} are {known}.")
-        axes = [joints.drawn_axes(t, n, planar) for t, n in zip(things, names, strict=True)]
-        attachment = attach(bodies, things, names, axes)
-        if kind is not joints.Distance:
-            return JointGroup(kind, planar, attachment, stack([np.ones(())] * len(things)))
-        return JointGroup(kind, planar, attachment, _lengths(bodies, attachment, things))
-
-    def residual(self, placed: Placed) -> Float[Array, "k r"]:
-        """`placed` are the bodies of the joints, `(2, k, ...)`."""
-        return self.equations(self.attachment.sides_of(placed), self.length)
+    def residual(self, sides: Sides) -> Float[Array, "k r"]:
+        if self.motions is not None:
+            return DRIVEN[self.kind](sides, self.length)
+        return (PLANAR if self.planar else SPATIAL)[self.kind](sides, self.length)
 
     def at(self, t: RealScalarLike, args: Args) -> "JointGroup":
         """Return the group with its motions at the time."""
         if self.motions is None:
             return self
-        names = self.attachment.names
-        return dataclasses.replace(
-            self, length=evaluate("motion", self.motions, t, args, (), names)
-        )
-
-    @property
-    def equations(self) -> Callable:
-        if self.motions is not None:
-            return DRIVEN[self.kind]
-        return (PLANAR if self.planar else SPATIAL)[self.kind]
-
-
-def group_joints(
-    bodies: Bodies, named: Iterable[tuple[joints.AbstractJoint, str]]
-) -> tuple[JointGroup, ...]:
-    """The joints by their kinds, in the order in which these come first."""
-    kinds: dict[type, tuple[list, list]] = {}
-    for joint, name in named:
-        of_kind = kinds.setdefault(type(joint), ([], []))
-        of_kind[0].append(joint)
-        of_kind[1].append(name)
-    return tuple(JointGroup.of(kind, bodies, *of_kind) for kind, of_kind in kinds.items())
+        return dataclasses.replace(self, length=self.motions.at(t, args))
 
 
 Found = tuple[JointGroup, int]  # a joint: its group and its place in that
 
 
-def find_joint(groups: tuple[JointGroup, ...], joint: str, name: str) -> Found:
-    """Find the joint for the force or drive called `name`."""
+def group_restraints(bodies: Bodies, given: Any) -> tuple[JointGroup, ...]:
+    named = name_all(given, joints.AbstractRestraint, "joint")
+    of_joints = [pair for pair in named if not isinstance(pair[0], joints.Drive)]
+    kinds = grouped(of_joints, lambda joint, name: type(joint))
+    groups = tuple(_group_joints(kind, bodies, *own) for kind, own in kinds.items())
+    advice = "Drives belong to `Revolute` and `Prismatic` joints."
+    drives = [
+        (drive, name, find_joint(groups, drive.joint, name, advice))
+        for drive, name in named
+        if isinstance(drive, joints.Drive)
+    ]
+    driven = [drive.joint for drive, *_ in drives]
+    if len(set(driven)) < len(driven):
+        twice = sorted({joint for joint in driven if driven.count(joint) > 1})
+        raise ValueError(f"A joint has one drive; there are several of {twice}.")
+    kinds = grouped(drives, lambda drive, name, found: found[0].kind)
+    return groups + tuple(_group_drives(kind, bodies.planar, *own) for kind, own in kinds.items())
+
+
+def find_joint(groups: tuple[JointGroup, ...], joint: str, name: str, advice: str) -> Found:
+    """Find the hinge or slider for the force or drive called `name`."""
     groups = tuple(group for group in groups if group.motions is None)
     for group in groups:
-        if joint in group.attachment.names:
-            return group, group.attachment.names.index(joint)
+        if joint not in group.attachment.names:
+            continue
+        if group.kind not in DRIVEN:
+            raise ValueError(
+                f"{name}: the joint {joint!r} is a {group.kind.__name__}, which has no single coordinate. {advice}"
+            )
+        return group, group.attachment.names.index(joint)
     known = [name for group in groups for name in group.attachment.names][:12]
     raise ValueError(f"{name} names the joint {joint!r}, which is not there. Joints are {known}.")
 
 
-def attachment_of(found: list[Found], names: Sequence[str]) -> Attachment:
+def attachment_of(found: tuple[Found, ...], names: tuple[str, ...]) -> Attachment:
     """Return the attachment to the bodies of joints, as these are."""
-
-    def of_joints(part: str) -> Array:
-        rows = [(getattr(group.attachment, part), i) for group, i in found]
-        if all(is_concrete(row) for row, _ in rows):
-            return jnp.asarray(np.stack([np.asarray(row)[:, i] for row, i in rows], axis=1))
-        return jnp.stack([row[:, i] for row, i in rows], axis=1)
-
     first, second = (
         tuple(group.attachment.bodies[side][i] for group, i in found) for side in (0, 1)
     )
-    return Attachment(tuple(names), (first, second), of_joints("points"), of_joints("axes"))
+    points = stack([on_host(group.attachment.points)[:, i] for group, i in found], axis=1)
+    axes = stack([on_host(group.attachment.axes)[:, i] for group, i in found], axis=1)
+    return Attachment(names, (first, second), points, axes)
 
 
-def _lengths(bodies: Bodies, attachment: Attachment, things: list[Any]) -> Float[Array, " k"]:
-    given: list[Array] = [rod.length for rod in things]
+def _group_drives(
+    kind: type, planar: bool, drives: tuple, names: tuple[str, ...], found: tuple[Found, ...]
+) -> JointGroup:
+    motions = Values("motion", names, (), [drive.motion for drive in drives])
+    return JointGroup(kind, planar, attachment_of(found, names), jnp.zeros(len(names)), motions)
+
+
+def _group_joints(kind: type, bodies: Bodies, things: tuple, names: tuple[str, ...]) -> JointGroup:
+    planar = bodies.planar
+    known = PLANAR if planar else SPATIAL
+    if kind not in known:
+        where = "the plane" if planar else "space"
+        known = ", ".join(k.__name__ for k in known)
+        raise ValueError(f"{names[0]}: joints in {where} are {known}.")
+    axes = [joints.drawn_axes(t, n, planar) for t, n in zip(things, names, strict=True)]
+    attachment = attach(bodies, things, names, axes)
+    if kind is not joints.Distance:
+        return JointGroup(kind, planar, attachment, stack([np.ones(())] * len(things)))
+    return JointGroup(kind, planar, attachment, _lengths(bodies, attachment, things))
+
+
+def _lengths(bodies: Bodies, attachment: Attachment, rods: tuple) -> Float[Array, " k"]:
+    given: list[Array] = [rod.length for rod in rods]
     if any(length is None for length in given):
         drawn = _drawn_lengths(attachment, bodies.drawing)
         given = [drawn[i] if length is None else length for i, length in enumerate(given)]
     for i, name in enumerate(attachment.names):
-        given[i] = length = check_number(f"{name}: `length`", given[i])
+        given[i] = length = check_shape(f"{name}: `length`", given[i], ())
         if is_concrete(length) and not float(length) > 0:
             raise ValueError(
                 f"{name}: `length` must be a positive number, got {length}. Two points that stay together are a "
@@ -119,28 +126,27 @@ def _lengths(bodies: Bodies, attachment: Attachment, things: list[Any]) -> Float
 
 @eqx.filter_jit
 def _drawn_lengths(attachment: Attachment, drawing: Pose) -> Float[Array, " k"]:
-    rows = with_ground(drawing)[attachment.index]
-    return length_of(attachment.sides_of(Placed.of_rows(rows, drawing.planar)).gap)
+    placed = Placed.of(with_ground(drawing.coordinates)[attachment.index])
+    return length_of(attachment.sides_of(placed).gap)
 
 
 def residuals(groups: tuple[JointGroup, ...], q: Pose) -> tuple[Float[Array, "k r"], ...]:
     """Return the residuals of all joints, kind by kind."""
-    return _residuals(groups, with_ground(q)[_index(groups)], q.planar)
+    return _residuals(groups, with_ground(q.coordinates)[_index(groups)])
 
 
 def jacobian(groups: tuple[JointGroup, ...], q: Pose) -> Float[Array, "r n c"]:
     """Derivatives of all equations of joints with respect to the coordinates of the bodies, of which
     each joint depends on two: one derivative for each coordinate of these, all joints at once."""
-    index, rows = _index(groups), with_ground(q)
+    index, rows = _index(groups), with_ground(q.coordinates)
     number, size = rows.shape
     if not groups:
         return jnp.zeros((0, number - 1, size), rows.dtype)
     here = rows[index]
-    along = lambda seed: jax.jvp(
-        lambda here: _residuals(groups, here, q.planar),
-        (here,),
-        (jnp.broadcast_to(seed[:, None, :], here.shape),),
-    )[1]
+    moved = lambda here: _residuals(groups, here)
+    along = lambda seed: jax.jvp(moved, (here,), (jnp.broadcast_to(seed[:, None, :], here.shape),))[
+        1
+    ]
     seeds = jnp.eye(2 * size, dtype=here.dtype).reshape(2 * size, 2, size)
     slopes = jax.vmap(along)(seeds)
     entries = [jnp.moveaxis(slope.reshape(2, size, -1), 1, 2) for slope in slopes]
@@ -153,13 +159,14 @@ def jacobian(groups: tuple[JointGroup, ...], q: Pose) -> Float[Array, "r n c"]:
     return whole[:, :-1]
 
 
-def _residuals(groups: tuple[JointGroup, ...], here: Float[Array, "2 k c"], planar: bool) -> Any:
+def _residuals(groups: tuple[JointGroup, ...], here: Float[Array, "2 k c"]) -> Any:
     """Compute the residuals from the coordinates of the bodies of all joints."""
-    placed = Placed.of_rows(here, planar)
+    placed = Placed.of(here)
     found, start = [], 0
     for group in groups:
         own = slice(start, start := start + len(group.attachment.names))
-        found.append(group.residual(Placed(placed.origin[:, own], placed.rotation[:, own])))
+        bodies = Placed(placed.origin[:, own], placed.rotation[:, own])
+        found.append(group.residual(group.attachment.sides_of(bodies)))
     return tuple(found)
 
 
@@ -171,18 +178,16 @@ def _index(groups: tuple[JointGroup, ...]) -> np.ndarray:
 
 def reactions(
     group: JointGroup, frames: Frames, multipliers: Float[Array, "k r"]
-) -> tuple[Float[Array, "k 3"], Float[Array, "k 3"]]:
+) -> tuple[Vectors, Vectors]:
     """Forces and torques on the second bodies at the second points: `-lambda` times the change of
     the equations when that body is moved or turned."""
     sides = group.attachment.sides(frames)
 
-    def moved(shift: Float[Array, "k 3"], angle: Float[Array, "k 3"]) -> Float[Array, "k r"]:
+    def moved(shift: Vectors, angle: Vectors) -> Float[Array, "k r"]:
         """About the second point, to first order."""
         axes = sides.frame_second
         turned = axes + jnp.cross(angle[:, :, None], axes, axis=1)
-        return group.equations(
-            sides._replace(second=sides.second + shift, frame_second=turned), group.length
-        )
+        return group.residual(sides._replace(second=sides.second + shift, frame_second=turned))
 
     still = jnp.zeros_like(sides.second)
     _, pull = jax.vjp(moved, still, still)

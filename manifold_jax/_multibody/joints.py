@@ -1,14 +1,13 @@
 """Joints, as a user says them. Points and axes are those of the drawing, the pose of the bodies in
 their `position` and `orientation`, in the coordinates of space."""
 
-import abc
 from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from .checks import as_pair, check_axis, check_vector, is_concrete
+from .checks import as_pair, check_axis, check_shape, is_concrete
 
 
 class AbstractRestraint(eqx.Module):
@@ -23,33 +22,21 @@ class AbstractJoint(AbstractRestraint):
     which the drawing need not be closed.
     """
 
-    first: eqx.AbstractVar[str]
-    second: eqx.AbstractVar[str]
+    first: str = eqx.field(static=True)
+    second: str = eqx.field(static=True)
     points: eqx.AbstractVar[Any]
     name: eqx.AbstractVar[str | None]
-
-    @property
-    @abc.abstractmethod
-    def drawn(self) -> tuple[Any, Any] | None:
-        """The two points of space in the drawing, or `None`."""
 
 
 class AbstractPointJoint(AbstractJoint):
     """A joint at one point."""
 
-    at: eqx.AbstractVar[Any]
-
-    @property
-    def drawn(self):
-        return None if self.at is None else (self.at, self.at)
+    at: Any = None
 
 
 class AbstractJointWithoutAxis(AbstractPointJoint):
-    """Its fields."""
+    """A joint that needs no direction."""
 
-    first: str = eqx.field(static=True)
-    second: str = eqx.field(static=True)
-    at: Any = None
     points: Any = None
     name: str | None = eqx.field(static=True, default=None)
 
@@ -57,9 +44,6 @@ class AbstractJointWithoutAxis(AbstractPointJoint):
 class AbstractJointWithAxis(AbstractPointJoint):
     """The kind says what its `axis` is."""
 
-    first: str = eqx.field(static=True)
-    second: str = eqx.field(static=True)
-    at: Any = None
     axis: Any = None
     points: Any = None
     name: str | None = eqx.field(static=True, default=None)
@@ -119,16 +103,10 @@ class Distance(AbstractJoint):
     - `length` (m), positive; by default that of the drawing.
     """
 
-    first: str = eqx.field(static=True)
-    second: str = eqx.field(static=True)
     between: Any = None
     length: Any = None
     points: Any = None
     name: str | None = eqx.field(static=True, default=None)
-
-    @property
-    def drawn(self):
-        return self.between
 
 
 class Drive(AbstractRestraint):
@@ -156,21 +134,25 @@ WITH_AXIS = {
     False: (Revolute, Universal, Cylindrical, Prismatic),
     True: (Prismatic,),  # in the plane
 }
+# Without an axis: of frames whose columns are those of the body, as far as possible.
+UPRIGHT = np.array([0.0, 0.0, 1.0]), np.array([0.0, 0.0, 1.0])
 
 
-def ends(thing: Any, name: str, planar: bool) -> tuple[bool, Any, Any]:
-    """The two points of a joint or a force, and whether they are those of the drawing."""
-    d = 2 if planar else 3
-    drawn, pair = thing.drawn, thing.points
-    word = "at" if isinstance(thing, AbstractPointJoint) else "between"
-    if (drawn is None) == (pair is None):
+def ends(thing: Any, name: str, planar: bool) -> tuple[bool, tuple[Any, Any]]:
+    """Whether the two points of a joint or a force are those of the drawing, and the points."""
+    if isinstance(thing, AbstractPointJoint):
+        word, drawn = "at", None if thing.at is None else (thing.at, thing.at)
+    else:
+        word, drawn = "between", thing.between
+    if (drawn is None) == (thing.points is None):
         raise ValueError(
             f"{name}: give either `{word}` (in space, as drawn) or `points` (a pair, one in the frame of each body)."
         )
-    pair, word = (pair, "points") if drawn is None else (drawn, word)
+    pair, word = (thing.points, "points") if drawn is None else (drawn, word)
     pair = as_pair(f"{name}: `{word}` must be a pair of points", pair)
-    first, second = (check_vector(f"{name}: `{word}`", point, d) for point in pair)
-    return drawn is not None, first, second
+    shape = (2 if planar else 3,)
+    first, second = (check_shape(f"{name}: `{word}`", point, shape) for point in pair)
+    return drawn is not None, (first, second)
 
 
 def drawn_axes(joint: AbstractJoint, name: str, planar: bool) -> tuple[Any, Any]:
@@ -183,15 +165,13 @@ def drawn_axes(joint: AbstractJoint, name: str, planar: bool) -> tuple[Any, Any]
             raise ValueError(
                 f"{name}: a {type(joint).__name__}{where} has no `axis`; leave it out."
             )
-        # of frames whose columns are those of the body, as far as possible
-        upright = np.array([0.0, 0.0, 1.0])
-        return upright, upright
+        return UPRIGHT
     if isinstance(joint, Universal):
         return _perpendicular(joint, name)
     if axis is None:
         raise ValueError(f"{name} needs an `axis` of shape ({2 if planar else 3},).")
     if planar:
-        axis = check_vector(f"{name}: `axis`", axis, 2)
+        axis = check_shape(f"{name}: `axis`", axis, (2,))
         axis = jnp.concatenate([axis, jnp.zeros(1, axis.dtype)])
     axis = check_axis(f"{name}: `axis`", axis)
     return axis, axis

@@ -9,12 +9,17 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._base.types import Args, FloatScalar, RealScalarLike
-from .attachment import Attachment
-from .checks import evaluate
-from .frames import Frames, in_space
+from . import forces, joints
+from .attachment import attach, Attachment, grouped, name_all
+from .bodies import Bodies
+from .checks import check_shape, is_concrete, stack, Values
+from .equations import DRIVEN
+from .frames import Frames, in_space, Vectors
+from .joint_groups import attachment_of, find_joint, Found, JointGroup
 from .rotations import dot, length_of, turn
 
 
+_ADVICE = "Springs and motors belong to `Revolute` and `Prismatic` joints; between points use `Spring` and `LinearActuator`."
 Wrench = tuple[Float[Array, "n 3"], Float[Array, "n 3"]]  # forces, torques about the origins
 
 
@@ -34,11 +39,10 @@ class SpringLaws(eqx.Module):
     """`stiffness (x - rest) + damping x' - value` against coordinates `x` of `k` forces; `values` is
     `None` where nothing is driven."""
 
-    names: tuple[str, ...] = eqx.field(static=True)
     stiffness: Float[Array, " k"]
     rest: Float[Array, " k"]
     damping: Float[Array, " k"]
-    values: tuple | None
+    values: Values | None
 
     def force(
         self, x: Float[Array, " k"], rate: Float[Array, " k"], t: RealScalarLike, args: Args
@@ -46,7 +50,7 @@ class SpringLaws(eqx.Module):
         size = self.stiffness * (x - self.rest) + self.damping * rate
         if self.values is None:
             return size
-        return size - evaluate("value", self.values, t, args, (), self.names)
+        return size - self.values.at(t, args)
 
     def energy(self, x: Float[Array, " k"]) -> FloatScalar:
         return jnp.sum(self.stiffness * (x - self.rest) ** 2) / 2
@@ -67,13 +71,10 @@ class LineLoads(AbstractLoads):
         at_first = apply(frames, first, sides.first, pull, none)
         return add(at_first, apply(frames, second, sides.second, -pull, none))
 
-    def _pull(
-        self, t: RealScalarLike, gap: Float[Array, "k 3"], velocity: Float[Array, "k 3"], args: Args
-    ) -> Float[Array, "k 3"]:
+    def _pull(self, t: RealScalarLike, gap: Vectors, velocity: Vectors, args: Args) -> Vectors:
         """Return the forces on the first points. Where two coincide, the direction of their line
-        is that of their
-        motion: the limit of what has one, not a number for what jumps there from one side to the
-        other."""
+        is that of their motion: the limit of what has one, not a number for what jumps there from
+        one side to the other."""
         distance = length_of(gap)
         apart = distance > 0
         direction = gap / jnp.where(apart, distance, 1)[:, None]
@@ -105,7 +106,7 @@ class JointLoads(AbstractLoads):
         else:
             turning = jnp.cross(frames.spin[first], axis)
             rate = dot(axis, self.attachment.velocities(frames, sides)) + dot(turning, sides.gap)
-        push = -self.laws.force(coordinate(sides, self.hinge), rate, t, args)[:, None] * axis
+        push = -self.laws.force(sides.coordinate(self.hinge), rate, t, args)[:, None] * axis
         none = jnp.zeros_like(axis)
         force, torque = (none, push) if self.hinge else (push, none)
         # both at the second point: a slider's force and its opposite lie on one line
@@ -113,27 +114,19 @@ class JointLoads(AbstractLoads):
         return add(on_second, apply(frames, first, sides.second, -force, -torque))
 
     def potential(self, frames: Frames) -> FloatScalar:
-        return self.laws.energy(coordinate(self.attachment.sides(frames), self.hinge))
-
-
-def coordinate(sides: Any, hinge: bool) -> Float[Array, " k"]:
-    return sides.angle if hinge else sides.along(2)
+        return self.laws.energy(self.attachment.sides(frames).coordinate(self.hinge))
 
 
 class BodyLoads(AbstractLoads):
     """Forces at points of bodies, or torques."""
 
     torque: bool = eqx.field(static=True)
-    planar: bool = eqx.field(static=True)
-    names: tuple[str, ...] = eqx.field(static=True)
     bodies: tuple[int, ...] = eqx.field(static=True)
     points: Float[Array, "k 3"]
-    values: tuple
+    values: Values
 
     def wrench(self, t: RealScalarLike, frames: Frames, args: Args) -> Wrench:
-        index = np.asarray(self.bodies)
-        shape = (() if self.torque else (2,)) if self.planar else (3,)
-        value = evaluate("value", self.values, t, args, shape, self.names)
+        index, value = np.asarray(self.bodies), self.values.at(t, args)
         if value.ndim == 1:  # about the normal of the plane
             value = jnp.pad(value[:, None], ((0, 0), (2, 0)))
         value, none = in_space(value), jnp.zeros_like(self.points)
@@ -146,13 +139,7 @@ class BodyLoads(AbstractLoads):
         return jnp.zeros((), frames.origin.dtype)
 
 
-def apply(
-    frames: Frames,
-    index: np.ndarray,
-    at: Float[Array, "k 3"],
-    force: Float[Array, "k 3"],
-    torque: Float[Array, "k 3"],
-) -> Wrench:
+def apply(frames: Frames, index: np.ndarray, at: Vectors, force: Any, torque: Any) -> Wrench:
     """Forces at points of space, and torques, summed for every body about its origin."""
     torque = torque + jnp.cross(at - frames.origin[index], force)
     none = jnp.zeros_like(frames.origin)
@@ -161,3 +148,61 @@ def apply(
 
 def add(a: Wrench, b: Wrench) -> Wrench:
     return a[0] + b[0], a[1] + b[1]
+
+
+_ADVICE = "Springs and motors belong to `Revolute` and `Prismatic` joints; between points use `Spring` and `LinearActuator`."
+
+
+def group_forces(
+    bodies: Bodies, groups: tuple[JointGroup, ...], given: Any
+) -> tuple[AbstractLoads, ...]:
+    in_joint = lambda force: isinstance(force, forces.AbstractJointForce)
+    named = [
+        (force, name, find_joint(groups, force.joint, name, _ADVICE) if in_joint(force) else None)
+        for force, name in name_all(given, forces.AbstractForce, "force")
+    ]
+    return tuple(_loads(kind, bodies, *own) for kind, own in grouped(named, _kind).items())
+
+
+def _kind(force: Any, name: str, found: Found | None) -> type:
+    """The kind of its joint if it is in one."""
+    if found is not None:
+        return found[0].kind
+    kinds = forces.AbstractLineForce, forces.Torque
+    return next((kind for kind in kinds if isinstance(force, kind)), forces.Force)
+
+
+def _loads(
+    kind: type, bodies: Bodies, things: tuple, names: tuple[str, ...], found: tuple
+) -> AbstractLoads:
+    if kind is forces.AbstractLineForce:
+        return LineLoads(attach(bodies, things, names), _laws(things, names, "length"))
+    if kind in DRIVEN:
+        laws = _laws(things, names, "rest")
+        return JointLoads(kind is joints.Revolute, attachment_of(found, names), laws)
+    return _on_bodies(kind is forces.Torque, bodies, things, names)
+
+
+def _laws(things: tuple, names: tuple[str, ...], rest: str) -> SpringLaws:
+    """What a force does not have is zero."""
+    named = list(zip(things, names, strict=True))
+    stiffness, rest_at, damping = (
+        stack([check_shape(f"{n}: `{word}`", getattr(thing, word, 0.0), ()) for thing, n in named])
+        for word in ("stiffness", rest, "damping")
+    )
+    values = Values("value", names, (), [getattr(thing, "value", 0.0) for thing in things])
+    driven = any(callable(v) or not is_concrete(v) or np.any(np.asarray(v)) for v in values.given)
+    return SpringLaws(stiffness, rest_at, damping, values if driven else None)
+
+
+def _on_bodies(torque: bool, bodies: Bodies, things: tuple, names: tuple[str, ...]) -> BodyLoads:
+    d = 2 if bodies.planar else 3
+    index, points = [], []
+    for thing, name in zip(things, names, strict=True):
+        index.append(bodies.moving_index(thing.body, name))
+        point = getattr(thing, "point", None)
+        point = np.zeros(d) if point is None else point
+        points.append(check_shape(f"{name}: `point`", point, (d,)))
+    shape = () if torque and bodies.planar else (d,)
+    values = Values("value", names, shape, [thing.value for thing in things])
+    return BodyLoads(torque, tuple(index), in_space(stack(points)), values)

@@ -38,16 +38,16 @@ class Tree:
                 position=drawing.xipos[i],
                 orientation=quaternion_of(self.mujoco, drawing.ximat[i]),
             )
-            for i in range(1, model.nbody)
-            if self.body(i) == self.name("body", i)
+            for i in self._moving()
         ]
 
     def joints(self) -> list[AbstractJoint]:
-        found = []
-        for i in range(1, self.model.nbody):
-            if self.body(i) == self.name("body", i):
-                found += self._joint(i)
-        return found
+        return [joint for i in self._moving() for joint in self._joint(i)]
+
+    def _moving(self) -> list[int]:
+        """Those that are not part of others."""
+        bodies = range(1, self.model.nbody)
+        return [i for i in bodies if self.body(i) == self.name("body", i)]
 
     def _joint(self, i: Index) -> list[AbstractJoint]:
         model, drawing, kinds = self.model, self.drawing, self.mujoco.mjtJoint
@@ -81,52 +81,39 @@ class Tree:
         )
 
     def equalities(self) -> list[AbstractJoint]:
-        model, drawing = self.model, self.drawing
+        model = self.model
         if disabled(self.mujoco, model, "EQUALITY"):
             return []
-        found = []
-        for e in range(model.neq):
-            if not model.eq_active0[e] or equality_fault(self.mujoco, model, e):
-                continue
-            name, data = self.name("equality", e), model.eq_data[e]
-            of_sites = int(model.eq_objtype[e]) == int(self.mujoco.mjtObj.mjOBJ_SITE)
-            objects = model.eq_obj1id[e], model.eq_obj2id[e]
-            bodies = [model.site_bodyid[i] for i in objects] if of_sites else list(objects)
-            if model.eq_type[e] == int(self.mujoco.mjtEq.mjEQ_WELD):
-                found.append(self._weld(name, bodies, objects, data, of_sites))
-                continue
-            local = (data[0:3], data[3:6])
-            where = [
-                drawing.site_xpos[i] if of_sites else self._in_space(b, p)
-                for i, b, p in zip(objects, bodies, local, strict=True)
-            ]
-            points = tuple(self._in_body(b, p) for b, p in zip(bodies, where, strict=True))
-            found.append(Spherical(*map(self.body, bodies), points=points, name=name))
-        return found
+        active = np.flatnonzero(model.eq_active0)
+        return [self._equality(e) for e in active if not equality_fault(self.mujoco, model, e)]
 
-    def _weld(self, name: str, bodies: list, objects: tuple, data: Any, of_sites: bool) -> Fixed:
-        drawing = self.drawing
-        first, second = (drawing.xmat[b].reshape(3, 3) for b in bodies)
-        turned, wanted = np.zeros(9), np.eye(3)
-        if not of_sites:
-            self.mujoco.mju_quat2Mat(turned, data[6:10])
-            wanted = turned.reshape(3, 3)
-            shift = self._in_space(bodies[1], data[0:3]) - self._in_space(bodies[0], data[3:6])
-            at = self._in_space(bodies[1], data[0:3])
-        else:
-            first, second = (drawing.site_xmat[i].reshape(3, 3) for i in objects)
-            shift = drawing.site_xpos[objects[1]] - drawing.site_xpos[objects[0]]
-            at = drawing.site_xpos[objects[1]]
-        if max(np.abs(shift).max(), np.abs(first.T @ second - wanted).max()) > 1e-6:
+    def _equality(self, e: Index) -> AbstractJoint:
+        """Of two bodies or sites, each with a point in its frame: a connect keeps the points together, a
+        weld the frames, too, which must be so in the drawing."""
+        model, drawing, mujoco = self.model, self.drawing, self.mujoco
+        name, data = self.name("equality", e), model.eq_data[e]
+        objects = bodies = model.eq_obj1id[e], model.eq_obj2id[e]
+        is_weld = int(model.eq_type[e]) == int(mujoco.mjtEq.mjEQ_WELD)
+        local = (data[3:6], data[0:3]) if is_weld else (data[0:3], data[3:6])
+        origins, frames, wanted = drawing.xpos, drawing.xmat, np.eye(3).ravel()
+        if int(model.eq_objtype[e]) == int(mujoco.mjtObj.mjOBJ_SITE):
+            bodies, local = [model.site_bodyid[i] for i in objects], np.zeros((2, 3))
+            origins, frames = drawing.site_xpos, drawing.site_xmat
+        elif is_weld:
+            mujoco.mju_quat2Mat(wanted, data[6:10])
+        first, second = (frames[i].reshape(3, 3) for i in objects)
+        one = origins[objects[0]] + first @ local[0]
+        other = origins[objects[1]] + second @ local[1]
+        if not is_weld:
+            points = self._in_body(bodies[0], one), self._in_body(bodies[1], other)
+            return Spherical(*map(self.body, bodies), points=points, name=name)
+        turned = first.T @ second - wanted.reshape(3, 3)
+        if max(np.abs(other - one).max(), np.abs(turned).max()) > 1e-6:
             raise ValueError(
                 f"The weld {name!r} holds its bodies in another pose than that of `qpos0`, which is not supported: give them "
                 "in the file as they are welded."
             )
-        return Fixed(*map(self.body, bodies), at=at, name=name)
-
-    def _in_space(self, body: Index, point: np.ndarray) -> np.ndarray:
-        """Return the position in space of a point in MuJoCo's frame of a body."""
-        return self.drawing.xpos[body] + self.drawing.xmat[body].reshape(3, 3) @ point
+        return Fixed(*map(self.body, bodies), at=other, name=name)
 
     def _in_body(self, body: Index, point: np.ndarray) -> np.ndarray:
         """Return the point in our frame, that of its inertia."""

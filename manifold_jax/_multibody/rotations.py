@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._base.types import BoolScalar
-from .checks import check_axis, check_number
+from .checks import check_axis, check_shape
 
 
 def quaternion(axis: Any, angle: Any) -> Float[Array, "4"]:
@@ -21,7 +21,7 @@ def quaternion(axis: Any, angle: Any) -> Float[Array, "4"]:
 
     - `axis`: shape `(3,)`, not zero. `angle`: in radian, counter-clockwise seen from its tip.
     """
-    return _about(check_axis("`axis`", axis), check_number("`angle`", angle))
+    return _about(check_axis("`axis`", axis), check_shape("`angle`", angle, ()))
 
 
 @jax.jit
@@ -47,6 +47,12 @@ def rates_matrix(p: Float[Array, "*n 4"]) -> Float[Array, "*n 3 4"]:
     a, b, c, d = p[..., 0], p[..., 1], p[..., 2], p[..., 3]
     rows = [[-b, a, d, -c], [-c, -d, a, b], [-d, c, -b, a]]
     return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+@jax.jit
+def quaternion_rate(p: Float[Array, "*n 4"], spin: Float[Array, "*n 3"]) -> Float[Array, "*n 4"]:
+    """`p' = G(p)^T R(p)^T omega / 2` of angular velocities in space."""
+    return turn_back(rates_matrix(p), turn_back(rotation_matrix(p), spin)) / 2
 
 
 def planar_rotation(angle: Float[Array, "*n"]) -> Float[Array, "*n 3 3"]:

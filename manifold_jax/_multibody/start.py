@@ -1,24 +1,28 @@
-"""States of an assembly: from what a user says of some bodies, and whether they satisfy the joints.
+"""States of an assembly: from what a user says of some bodies, and whether and how they satisfy the joints,
+by NumPy where all numbers are known, otherwise (inside of `jit`, `vmap` and derivatives) in the program
+that is traced.
 
 Source of the assembly analysis: Haug, Computer Aided Kinematics and Dynamics of Mechanical Systems
-(1989), ch. 4, here with steps of least norm.
+(1989), ch. 4, here with steps of least norm, `x - J^+ phi(x)` in what is free.
 """
 
+import functools
 from collections.abc import Callable
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.flatten_util as jfu
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
 from .._base.types import Args
+from .._linalg.dense import pseudo_invert
 from .bodies import check_orientation, Pose
-from .checks import check_number, check_vector, is_concrete, stack
-from .rotations import rates_matrix, rotation_matrix
-from .traced_start import assemble_traced
+from .checks import check_shape, is_concrete, on_host, stack
+from .rotations import quaternion_rate
 
 
 # Joints count as closed below this gap (m, or the cosine of an angle), or this many units of rounding.
@@ -27,61 +31,47 @@ ITERATIONS = 50
 # Singular values below this fraction of the largest belong to equations that depend on others; at
 # least a hundred units of rounding.
 DEPENDENT = 1e-9
-
-
-def _closed(x: np.ndarray) -> float:
-    largest = float(np.abs(x).max(initial=1))
-    return max(CLOSED, ROUNDING * float(np.finfo(x.dtype).eps) * largest)
-
-
-def _dependent(J: np.ndarray) -> float:
-    return max(DEPENDENT, 100 * float(np.finfo(J.dtype).eps))
+# Likewise eigenvalues of `J J^T`, in a program that is traced.
+DEPENDENT_TRACED = 1e-12
 
 
 def make_state(
     assembly: Any, given: tuple, assemble: bool, t: Array, args: Args
 ) -> tuple[Pose, Pose]:
-    y, fixed = _with_given(assembly, given)
-    if not all(is_concrete(leaf) for leaf in jtu.tree_leaves((y, assembly, t, args))):
-        if not assemble:
-            return y
-        names = _named_rows(assembly, t, args)
-        eps = float(jnp.finfo(y[0].position.dtype).eps)
-        closed = max(CLOSED, ROUNDING * eps)
-        return assemble_traced(assembly, y, fixed, t, args, names, ITERATIONS, closed)
-    find = _Host(assembly, y, fixed, t, args)
+    y, kept = _with_given(assembly, given)
+    known = all(is_concrete(leaf) for leaf in jtu.tree_leaves((y, assembly, t, args)))
+    if not known and not assemble:
+        return y
+    closing = Closing(assembly, y, kept, t, args)
+    if not known:
+        return closing.assembled_when_run()
     if assemble:
-        y = find.assembled(y)
-    find.check(y)
+        y = closing.assembled()
+    closing.check(y)
     return y
 
 
-def _with_given(assembly: Any, given: tuple) -> tuple[tuple[Pose, Pose], tuple[Pose, Pose]]:
-    """The state, and where it was given."""
+def _with_given(
+    assembly: Any, given: tuple
+) -> tuple[tuple[Pose, Pose], tuple[np.ndarray, np.ndarray]]:
+    """The state, and which of its coordinates and of their rates are given."""
     bodies = assembly.bodies
     q, planar = bodies.drawing, bodies.planar
     positions, orientations, velocities, spins = given
     d = 2 if planar else 3
-    vector = lambda what, value: check_vector(what, value, d)
+    vector = lambda what, value: check_shape(what, value, (d,))
     turned = lambda what, value: check_orientation(what, value, planar)
-    spin = check_number if planar else vector
+    spin = (lambda what, value: check_shape(what, value, ())) if planar else vector
     x, has_x = _place(bodies, q.position, positions, "positions", vector)
     p, has_p = _place(bodies, q.orientation, orientations, "orientations", turned)
-    still = np.zeros((len(bodies.names), 3), q.coordinates.dtype)
+    still = np.zeros(q.coordinates.shape, q.coordinates.dtype)
     u, has_u = _place(bodies, still[:, :d], velocities, "velocities", vector)
-    no_spin = still[:, 0] if planar else still
+    no_spin = still[:, 2] if planar else still[:, :3]
     w, has_w = _place(bodies, no_spin, spins, "angular_velocities", spin)
     rate = w if planar else quaternion_rate(p, w)
-    spread = lambda has, like: np.broadcast_to(has.reshape(-1, *(1,) * (like.ndim - 1)), like.shape)
-    fixed = Pose(spread(has_x, x), spread(has_p, p)), Pose(spread(has_u, x), spread(has_w, p))
-    return (Pose(x, p), Pose(u, rate)), fixed
-
-
-@jax.jit
-def quaternion_rate(p: Any, spin: Any) -> Any:
-    """`p' = G(p)^T R(p)^T omega / 2` of angular velocities in space, `(..., 3)`."""
-    local = jnp.sum(rotation_matrix(p) * spin[..., :, None], axis=-2)
-    return jnp.sum(rates_matrix(p) * local[..., :, None], axis=-2) / 2
+    widths = d, q.coordinates.shape[-1] - d
+    kept = lambda *has: np.repeat(np.stack(has, axis=1), widths, axis=1)
+    return (Pose(x, p), Pose(u, rate)), (kept(has_x, has_p), kept(has_u, has_w))
 
 
 def _place(
@@ -92,80 +82,90 @@ def _place(
     if not isinstance(words, dict):
         raise TypeError(f"`{what}` must be a dictionary of names of bodies, got {words!r}.")
     has = np.zeros(len(bodies.names), bool)
-    rows = list(np.asarray(rows) if is_concrete(rows) else rows)
+    rows = list(on_host(rows))
     for name, value in words.items():
         i = bodies.moving_index(name, f"`{what}`")
         rows[i], has[i] = checked(f"`{what}` of {name!r}", value), True
     return stack(rows), has
 
 
-class _Host:
-    """The equations of an assembly and their Jacobians as NumPy arrays."""
+class Closing:
+    """The equations of an assembly as functions of the vector `x` of its coordinates, from the state
+    `x`, `w` whose `free_x`, `free_w` may be moved."""
 
     def __init__(
-        self, assembly: Any, y: tuple[Pose, Pose], fixed: tuple[Pose, Pose], t: Array, args: Args
+        self, assembly: Any, y: tuple[Pose, Pose], kept: tuple[Any, Any], t: Array, args: Args
     ):
-        self.assembly, self.fixed, self.at = assembly, fixed, (t, args)
-        self.unravel = jfu.ravel_pytree(y[0])[1]
-        phi = lambda t, x: jfu.ravel_pytree(assembly._equations(t, self.unravel(x), args))[0]
-        rate = lambda x: jax.jvp(lambda t: phi(t, x), (t,), (jnp.ones_like(t),))
-        self.equations: Callable = jax.jit(lambda x: (*rate(x), jax.jacfwd(phi, 1)(t, x)))
+        self.assembly, self.at = assembly, (t, args)
+        (self.x, self.unravel), (self.w, _) = map(jfu.ravel_pytree, y)
+        self.free_x, self.free_w = (np.flatnonzero(~part) for part in kept)
+        joints = assembly.system.holonomic
+        phi = lambda t, x: jfu.ravel_pytree(joints(t, self.unravel(x), args))[0]
+        self.phi = lambda x: phi(t, x)
+        self.jacobian = lambda x: jax.jacfwd(phi, 1)(t, x)
+        # The rates of the equations while nothing moves: those of drives.
+        self.driven = lambda x: jax.jvp(lambda t: phi(t, x), (t,), (jnp.ones_like(t),))[1]
+        compiled = jax.jit(lambda x: (self.phi(x), self.driven(x), self.jacobian(x)))
+        self.known = lambda x: map(np.asarray, compiled(x))
 
-    def __call__(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Residuals, their rates while nothing moves (that of drives), and their Jacobian."""
-        phi, rate, J = map(np.asarray, self.equations(x))
-        return phi, rate, J
+    @functools.cached_property
+    def named_rows(self) -> list[tuple[str, np.ndarray]]:
+        """The rows of every joint among the equations."""
+        (t, args), bodies = self.at, self.assembly.bodies
+        of_joints = lambda: self.assembly.system.holonomic(t, bodies.drawing, args)
+        named, start = [], 0
+        for group, part in zip(self.assembly.joints, jax.eval_shape(of_joints), strict=False):
+            rows = start + np.arange(part.size).reshape(part.shape)
+            named += list(zip(group.attachment.names, rows, strict=True))
+            start += part.size
+        norms = () if bodies.planar else bodies.names
+        return named + [
+            (f"norm of {name!r}", np.array([start + i])) for i, name in enumerate(norms)
+        ]
 
-    def assembled(self, y: tuple[Pose, Pose]) -> tuple[Pose, Pose]:
+    def assembled(self) -> tuple[Pose, Pose]:
         """Gauss-Newton steps of least norm in what is free; velocities by one."""
-        x, w = (np.array(jfu.ravel_pytree(part)[0]) for part in y)
-        kept_x, kept_w = (
-            np.concatenate([np.ravel(leaf) for leaf in jtu.tree_leaves(part)])
-            for part in self.fixed
-        )
+        x, w = np.array(self.x), np.array(self.w)
         for _ in range(ITERATIONS):
-            phi, _, J = self(x)
+            phi, _, J = self.known(x)
             if np.abs(phi).max(initial=0) < 10 * np.finfo(x.dtype).eps:
                 break
-            x[~kept_x] -= np.linalg.lstsq(J[:, ~kept_x], phi, rcond=_dependent(J))[0]
-        self.check_positions(x, " Whatever the other bodies do, the joints cannot be closed")
-        _, rate, J = self(x)
-        w[~kept_w] -= np.linalg.lstsq(J[:, ~kept_w], rate + J @ w, rcond=_dependent(J))[0]
+            x[self.free_x] -= np.linalg.lstsq(J[:, self.free_x], phi, rcond=_dependent(J))[0]
+        advice = "Whatever the other bodies do, the joints cannot be closed: check lengths and points, or give less."
+        self._check_positions(x, advice)
+        _, driven, J = self.known(x)
+        rate = driven + J @ w
+        w[self.free_w] -= np.linalg.lstsq(J[:, self.free_w], rate, rcond=_dependent(J))[0]
         return self.unravel(jnp.asarray(x)), self.unravel(jnp.asarray(w))
 
     def check(self, y: tuple[Pose, Pose]) -> None:
         x, w = (np.array(jfu.ravel_pytree(part)[0]) for part in y)
-        self.check_positions(x, "")
-        _, driven, J = self(x)
-        rate = np.abs(driven + J @ w)
+        advice = "Give `assemble=True` to close them, or correct positions and orientations."
+        self._check_positions(x, advice)
+        _, driven, J = self.known(x)
+        what = "The velocities do not agree with the joints"
+        advice = "Give only those that are known, such that joints allow them, and `assemble=True`."
         most = _closed(x) * max(1, np.abs(w).max())
-        if not rate.max(initial=0) <= most:
-            worst = self._worst(rate, most, "m/s")
-            raise ValueError(
-                f"The velocities do not agree with the joints: {worst}. Give only those that are known, "
-                "such that joints allow them, and `assemble=True`."
-            )
+        self._refuse_gaps(np.abs(driven + J @ w), most, "m/s", what, advice)
         if not self.assembly.redundant:
             self._check_rank(J)
 
-    def check_positions(self, x: np.ndarray, reason: str) -> None:
-        gap = np.abs(self(x)[0])
-        if not gap.max(initial=0) <= _closed(x):
-            advice = (
-                f"{reason}: check lengths and points, or give less."
-                if reason
-                else " Give `assemble=True` to close them, or correct positions and orientations."
-            )
-            raise ValueError(
-                f"The state does not satisfy the joints: {self._worst(gap, _closed(x), 'm')}.{advice}"
-            )
+    def _check_positions(self, x: np.ndarray, advice: str) -> None:
+        phi, _, _ = self.known(x)
+        what = "The state does not satisfy the joints"
+        self._refuse_gaps(np.abs(phi), _closed(x), "m", what, advice)
 
-    def _worst(self, size: np.ndarray, most: float, unit: str) -> str:
-        named = _named_rows(self.assembly, *self.at)
-        largest = [size[rows].max() for _, rows in named]
-        order = np.argsort(largest)[::-1][:5]
-        worst = [(named[i][0], largest[i]) for i in order if not largest[i] <= most]
-        return ", ".join(f"{name} (gap {gap:.3g} {unit})" for name, gap in worst)
+    def _refuse_gaps(
+        self, gaps: np.ndarray, most: float, unit: str, what: str, advice: str
+    ) -> None:
+        """Raise with the names of the joints that have the largest gaps, if there are some."""
+        if gaps.max(initial=0) <= most:
+            return
+        sizes = [(name, gaps[rows].max()) for name, rows in self.named_rows]
+        order = np.argsort([size for _, size in sizes])[::-1][:5]
+        largest = [sizes[i] for i in order if not sizes[i][1] <= most]
+        worst = ", ".join(f"{name} (gap {size:.3g} {unit})" for name, size in largest)
+        raise ValueError(f"{what}: {worst}. {advice}")
 
     def _check_rank(self, J: np.ndarray) -> None:
         J = J / np.maximum(np.linalg.norm(J, axis=1, keepdims=True), np.finfo(J.dtype).tiny)
@@ -174,23 +174,58 @@ class _Host:
         if rank == J.shape[0]:
             return
         among = np.abs(left[:, rank:]).max(axis=1)
-        named = _named_rows(self.assembly, *self.at)
-        names = [name for name, rows in named if among[rows].max() > 1e-6]
+        names = [name for name, rows in self.named_rows if among[rows].max() > 1e-6]
         raise ValueError(
             f"{J.shape[0] - rank} of the {J.shape[0]} equations of the joints depend on others in this pose, among those of "
             f"{', '.join(names[:10])}{', ...' if len(names) > 10 else ''}. If they do so in every pose (closed loops), "
             "write `Assembly(..., redundant=True)`; if in this one alone, start beside it."
         )
 
+    def assembled_when_run(self) -> tuple[Pose, Pose]:
+        """The same steps in a traced program, with derivatives through all of them. While it runs an
+        error says which joint could not be closed."""
 
-def _named_rows(assembly: Any, t: Array, args: Args) -> list[tuple[str, np.ndarray]]:
-    """The rows of every joint among the equations."""
-    named, start = [], 0
-    at_drawing = lambda: assembly._equations(t, assembly.bodies.drawing, args)
-    for group, part in zip(assembly.joints, jax.eval_shape(at_drawing), strict=False):
-        rows = start + np.arange(part.size).reshape(part.shape)
-        named += list(zip(group.attachment.names, rows, strict=True))
-        start += part.size
-    norms = assembly.bodies.names if not assembly.bodies.planar else ()
-    named += [(f"norm of {name!r}", np.array([start + i])) for i, name in enumerate(norms)]
-    return named
+        def corrected(x: Float[Array, " n"]) -> Float[Array, " n"]:
+            J = self.jacobian(x)[:, self.free_x]
+            return x.at[self.free_x].add(-_least_norm(J, self.phi(x)))
+
+        def iterate(x: Float[Array, " n"], _: Any) -> tuple[Float[Array, " n"], None]:
+            unfinished = jnp.max(jnp.abs(self.phi(x)), initial=0) >= 10 * jnp.finfo(x.dtype).eps
+            return jax.lax.cond(unfinished, corrected, lambda x: x, x), None
+
+        x, _ = jax.lax.scan(iterate, self.x, None, length=ITERATIONS)
+        x = corrected(x)  # of which the derivative is that of a root
+        J, driven = self.jacobian(x), self.driven(x)
+        rate = lambda w: driven + J @ w
+        w = self.w.at[self.free_w].add(-_least_norm(J[:, self.free_w], rate(self.w)))
+        largest = jnp.maximum(1, jnp.max(jnp.abs(jax.lax.stop_gradient(w)), initial=0))
+        x = self._raise_unless_closed(x, self.phi(x), "the joints cannot be closed")
+        fault = "the velocities given disagree with the joints"
+        w = self._raise_unless_closed(w, rate(w) / largest, fault)
+        return self.unravel(x), self.unravel(w)
+
+    def _raise_unless_closed(
+        self, x: Float[Array, " n"], gap: Float[Array, " m"], fault: str
+    ) -> Float[Array, " n"]:
+        gaps = jnp.stack([jnp.max(jnp.abs(gap[rows])) for _, rows in self.named_rows])
+        messages = [
+            f"`assemble=True`: whatever the other bodies do, {fault}, {name} least of all. Check lengths and points, or "
+            "give less."
+            for name, _ in self.named_rows
+        ]
+        failed = ~(jnp.max(gaps) <= _closed(np.zeros(1, x.dtype)))
+        worst = jnp.argmax(jnp.where(jnp.isnan(gaps), jnp.inf, gaps))
+        return eqx.branched_error_if(x, failed, worst, messages)
+
+
+def _least_norm(J: Float[Array, "m n"], b: Float[Array, " m"]) -> Float[Array, " n"]:
+    return J.T @ pseudo_invert(J @ J.T, equilibrated=True, dependent=DEPENDENT_TRACED).solve(b)
+
+
+def _closed(x: np.ndarray) -> float:
+    largest = float(np.abs(x).max(initial=1))
+    return max(CLOSED, ROUNDING * float(np.finfo(x.dtype).eps) * largest)
+
+
+def _dependent(J: np.ndarray) -> float:
+    return max(DEPENDENT, 100 * float(np.finfo(J.dtype).eps))

@@ -4,11 +4,16 @@ from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
+import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._base.types import Args, RealScalarLike
 from .._mechanics import AbstractPositions, MechanicalSystem
 from .bodies import Pose
+from .frames import Frames
+from .joint_groups import jacobian, residuals
+from .loads import add
+from .rotations import rates_matrix, turn_back
 
 
 class ConstantAssembly(eqx.Module):
@@ -26,20 +31,42 @@ class _Mass(eqx.Module):
 
 
 class _Joints(AbstractPositions):
+    """Their equations, and the norms of quaternions."""
+
     source: Callable
 
     def __call__(self, t: RealScalarLike, q: Pose, args: Args) -> tuple[Array, ...]:
-        return self.source(args)._equations(t, q, args)
+        equations = residuals(self.source(args).joints_at(t, args), q)
+        if q.planar:
+            return equations
+        return (*equations, (jnp.sum(q.orientation**2, axis=1) - 1) / 2)
 
     def jacobian(self, t: RealScalarLike, q: Pose, args: Args) -> Float[Array, "m n"]:
-        return self.source(args)._jacobian(t, q, args)
+        rows = jacobian(self.source(args).joints_at(t, args), q)
+        if not q.planar:
+            p, own = q.orientation, jnp.eye(q.position.shape[0], dtype=rows.dtype)
+            norms = own[:, :, None] * jnp.pad(p, ((0, 0), (3, 0)))[:, None, :]
+            rows = jnp.concatenate([rows, norms])
+        return rows.reshape(rows.shape[0], -1)
 
 
 class _Forces(eqx.Module):
+    """Weight and loads, and the gyroscopic forces on quaternions."""
+
     source: Callable
 
     def __call__(self, t: RealScalarLike, q: Pose, v: Pose, args: Args) -> Pose:
-        return self.source(args)._force(t, q, v, args)
+        assembly, frames = self.source(args), Frames.of(q, v)
+        weight = assembly.bodies.mass[:, None] * assembly.gravity[None, :]
+        total = jnp.pad(weight, ((0, 1), (0, 0))), jnp.zeros_like(frames.origin)
+        for loads in assembly.loads:
+            total = add(total, loads.wrench(t, frames, args))
+        force, torque = total[0][:-1], total[1][:-1]
+        if q.planar:
+            return Pose(force[:, :2], torque[:, 2])
+        local = turn_back(frames.rotation[:-1], torque)
+        turning = 2 * turn_back(rates_matrix(q.orientation), local)
+        return Pose(force, turning + assembly.bodies.gyroscopic(q, v))
 
 
 def system_of(source: Callable, redundant: bool) -> MechanicalSystem:
