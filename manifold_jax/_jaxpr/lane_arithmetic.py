@@ -6,29 +6,24 @@ of the structure, as in Jacobians and tableaus.
 
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from . import primitives
 from .lane_arrays import Lanes
 from .lane_value import Number, object_array, Value
+from .primitives import evaluated, unsharded
 
 
-ELEMENTWISE = frozenset(
-    "abs acos acosh add add_any and asin asinh atan atan2 atanh cbrt ceil clamp convert_element_type "
-    "copy copy_p cos cosh digamma div eq erf erf_inv erfc exp exp2 expm1 floor ge gt integer_pow "
-    "is_finite le lgamma log log1p logistic lt max min mul ne neg nextafter not or pow rem round rsqrt "
-    "select_n sign sin sinh sqrt square stop_gradient sub tan tanh xor".split()
+ELEMENTWISE = frozenset({*primitives.VANISHING, *primitives.ELEMENTWISE}).union(
+    ("copy_p", "div", "integer_pow", "mul", "select_n")
 )
 
 
 def elementwise(lanes: Lanes, equation: Any, values: list[Value]) -> list[Value]:
     aval = equation.outvars[0].aval
     operands = [np.broadcast_to(v.numbers(), aval.shape) for v in values]
-    params = {k: v for k, v in equation.params.items() if k != "sharding"}
-    if "sharding" in equation.params:
-        params["sharding"] = None
+    params = unsharded(equation.params)
     out = [
         apply(lanes, equation.primitive, params, aval.dtype, [x[index] for x in operands])
         for index in np.ndindex(*aval.shape)
@@ -40,7 +35,7 @@ def apply(
     lanes: Lanes, primitive: Any, params: dict[str, Any], dtype: Any, numbers: list[Number]
 ) -> Number:
     if all(isinstance(x, np.generic) for x in numbers):
-        return _of_constants(primitive, params, numbers)
+        return evaluated(primitive, params, numbers)[0][()]
     rule = _SHORTER.get(primitive.name)
     shorter = None if rule is None else rule(lanes, params, *numbers)
     return lanes.apply(primitive, params, dtype, *numbers) if shorter is None else shorter
@@ -52,25 +47,6 @@ def add(lanes: Lanes, a: Number, b: Number) -> Number:
 
 def multiply(lanes: Lanes, a: Number, b: Number) -> Number:
     return apply(lanes, lax.mul_p, {}, a.dtype, [a, b])
-
-
-def _of_constants(primitive: Any, params: dict[str, Any], numbers: list[np.generic]) -> np.generic:
-    plain = _PLAIN.get(primitive.name)
-    if plain is not None and np.issubdtype(numbers[0].dtype, np.floating):
-        with np.errstate(all="ignore"):
-            return numbers[0].dtype.type(plain(*numbers))
-    with jax.ensure_compile_time_eval():
-        return np.asarray(primitive.bind(*map(jnp.asarray, numbers), **params))[()]  # pyright: ignore[reportReturnType]
-
-
-_PLAIN = {
-    "add": np.add,
-    "add_any": np.add,
-    "sub": np.subtract,
-    "mul": np.multiply,
-    "neg": np.negative,
-    "div": np.divide,
-}
 
 
 def _is(x: Number, value: int) -> bool:

@@ -1,12 +1,16 @@
 """An array that every lane has one of, as separate numbers or as a whole."""
 
+import math
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.core
 import jax.numpy as jnp
+import jax.tree_util as jtu
 import numpy as np
+
+from .trace import example
 
 
 class Node:
@@ -31,8 +35,8 @@ Number = Any
 
 class Value:
     """An array of shape `shape` in each lane. `numbers()` is an object array of that shape of
-    [`Number`][]s;
-    `whole(lanes)` an array of shape `(*shape, count)`: the lanes are contiguous in memory.
+    [`Number`][]s; `whole(lanes)` an array of shape `(*shape, count)`: the lanes are contiguous in
+    memory.
 
     Whichever is not there is made when it is asked for.
     """
@@ -48,10 +52,8 @@ class Value:
     @staticmethod
     def of_constant(x: Any) -> "Value":
         """The same in every lane: an array, also one that is being traced."""
-        if isinstance(x, jax.core.Tracer | jax.Array) and not _is_known(x):
-            return Value(x.shape, x.dtype, lambda: _split(x, x.shape))
-        x = np.asarray(x)
-        return Value(x.shape, x.dtype, lambda: _known_numbers(x))
+        x = x if isinstance(x, jax.core.Tracer) else np.asarray(x)
+        return Value(x.shape, x.dtype, lambda: _split(x, x.shape))
 
     @staticmethod
     def of_whole(x: jax.Array) -> "Value":
@@ -91,7 +93,7 @@ class Value:
         return all(isinstance(x, np.generic) for x in self.numbers().flat)
 
     def known(self) -> np.ndarray:
-        return np.array([x for x in self.numbers().flat], self.dtype).reshape(self.shape)
+        return np.array(list(self.numbers().flat), self.dtype).reshape(self.shape)
 
 
 def object_array(items: list[Any], shape: tuple[int, ...]) -> np.ndarray:
@@ -102,13 +104,56 @@ def object_array(items: list[Any], shape: tuple[int, ...]) -> np.ndarray:
     return out.reshape(shape)
 
 
-def _split(x: jax.Array, shape: tuple[int, ...]) -> np.ndarray:
+def _split(x: Any, shape: tuple[int, ...]) -> np.ndarray:
     return object_array([x[index] for index in np.ndindex(*shape)], shape)
 
 
-def _known_numbers(x: np.ndarray) -> np.ndarray:
-    return object_array([x[index] for index in np.ndindex(*x.shape)], x.shape)
+class Layout(NamedTuple):
+    """How columns, one number of each lane or each trajectory, make up a tree."""
+
+    treedef: Any
+    shapes: list[tuple[int, ...]]
+    dtypes: list[Any]
+
+    @staticmethod
+    def of(tree: Any) -> "Layout":
+        """Return the layout of a tree of [`Value`][]s, or of arrays of one trajectory."""
+        leaves, treedef = jtu.tree_flatten(tree)
+        return Layout(treedef, [x.shape for x in leaves], [x.dtype for x in leaves])
+
+    @staticmethod
+    def of_one(tree: Any) -> "Layout":
+        """Return the layout of one of the trajectories that arrays have in front."""
+        return Layout.of(jtu.tree_map(lambda x: example(x.shape[1:], x.dtype), tree))
+
+    def dtypes_of_columns(self) -> list[Any]:
+        each = zip(self.shapes, self.dtypes, strict=True)
+        return [dtype for shape, dtype in each for _ in range(math.prod(shape))]
+
+    def example(self) -> Any:
+        """Return an example to trace functions of one trajectory with."""
+        leaves = [example(s, d) for s, d in zip(self.shapes, self.dtypes, strict=True)]
+        return jtu.tree_unflatten(self.treedef, leaves)
+
+    def values(self, columns: list[jax.Array]) -> Any:
+        out, k = [], 0
+        for shape, dtype in zip(self.shapes, self.dtypes, strict=True):
+            size = math.prod(shape)
+            out.append(Value.of_numbers(object_array(columns[k : k + size], shape), dtype))
+            k += size
+        return jtu.tree_unflatten(self.treedef, out)
+
+    def arrays(self, columns: list[jax.Array]) -> Any:
+        """Return the arrays of columns, with the trajectories in front."""
+        rows = columns[0].shape[0] if columns else 0
+
+        def array(value: Value) -> jax.Array:
+            numbers = list(value.numbers().flat)
+            found = jnp.stack(numbers, axis=1) if numbers else jnp.zeros(0, value.dtype)
+            return found.reshape(rows, *value.shape)
+
+        return jtu.tree_map(array, self.values(columns))
 
 
-def _is_known(x: Any) -> bool:
-    return isinstance(x, jax.Array) and not isinstance(x, jax.core.Tracer)
+def columns_of_values(tree: Any, lanes: Any) -> list[jax.Array]:
+    return [column for value in jtu.tree_leaves(tree) for column in value.columns(lanes)]

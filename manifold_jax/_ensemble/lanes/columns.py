@@ -1,67 +1,14 @@
 """Trees of values as lists of columns, one number of each lane or each trajectory."""
 
 import math
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 
-from ..._jaxpr.lane_arrays import Lanes
-from ..._jaxpr.lane_value import object_array, Value
-from ..._jaxpr.trace import example
-
-
-class Layout(NamedTuple):
-    """How columns make up a tree."""
-
-    treedef: Any
-    shapes: list[tuple[int, ...]]
-    dtypes: list[Any]
-
-    @staticmethod
-    def of(tree: Any) -> "Layout":
-        """Return the layout of a tree of [`Value`][]s, or of arrays of one trajectory."""
-        leaves, treedef = jtu.tree_flatten(tree)
-        return Layout(treedef, [x.shape for x in leaves], [x.dtype for x in leaves])
-
-    @staticmethod
-    def of_one(tree: Any) -> "Layout":
-        """Return the layout of one of the trajectories that arrays have in front."""
-        return Layout.of(jtu.tree_map(lambda x: example(x.shape[1:], x.dtype), tree))
-
-    def dtypes_of_columns(self) -> list[Any]:
-        each = zip(self.shapes, self.dtypes, strict=True)
-        return [dtype for shape, dtype in each for _ in range(math.prod(shape))]
-
-    def example(self) -> Any:
-        """Return an example to trace functions of one trajectory with."""
-        leaves = [example(s, d) for s, d in zip(self.shapes, self.dtypes, strict=True)]
-        return jtu.tree_unflatten(self.treedef, leaves)
-
-    def values(self, columns: list[jax.Array]) -> Any:
-        out, k = [], 0
-        for shape, dtype in zip(self.shapes, self.dtypes, strict=True):
-            size = int(np.prod(shape))
-            out.append(Value.of_numbers(object_array(columns[k : k + size], shape), dtype))
-            k += size
-        return jtu.tree_unflatten(self.treedef, out)
-
-    def arrays(self, columns: list[jax.Array]) -> Any:
-        """Return the arrays of columns, with the trajectories in front."""
-        out, k = [], 0
-        rows = columns[0].shape[0] if columns else 0
-        for shape, dtype in zip(self.shapes, self.dtypes, strict=True):
-            size = int(np.prod(shape))
-            found = jnp.stack(columns[k : k + size], axis=1) if size else jnp.zeros(0, dtype)
-            out.append(found.reshape(rows, *shape))
-            k += size
-        return jtu.tree_unflatten(self.treedef, out)
-
-
-def columns_of_values(tree: Any, lanes: Lanes) -> list[jax.Array]:
-    return [column for value in jtu.tree_leaves(tree) for column in value.columns(lanes)]
+from ..._jaxpr.lane_value import Layout
 
 
 def columns_of_arrays(tree: Any) -> list[jax.Array]:

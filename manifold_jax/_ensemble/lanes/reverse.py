@@ -14,12 +14,10 @@ from jaxtyping import Array
 
 from ..._jaxpr.lane_arrays import Lanes
 from ..._jaxpr.lane_interpreter import call_in_lanes
-from ..._jaxpr.lane_value import Value
+from ..._jaxpr.lane_value import columns_of_values, Layout, Value
 from .columns import (
     added,
     columns_of_arrays,
-    columns_of_values,
-    Layout,
     read,
     stacked,
     taken,

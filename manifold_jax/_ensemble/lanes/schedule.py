@@ -10,11 +10,10 @@ from jaxtyping import Array
 
 from ..._jaxpr.lane_arrays import Lanes
 from ..._jaxpr.lane_interpreter import call_in_lanes
+from ..._jaxpr.lane_value import columns_of_values, Layout
 from .columns import (
     columns_of_arrays,
-    columns_of_values,
     empty_table,
-    Layout,
     read,
     taken,
     where,
