@@ -139,28 +139,15 @@ def may_jump(controller: Any, made_jump: Any) -> bool:
     return not isinstance(controller, known)
 
 
-class SolveOutputs(NamedTuple):
+def outputs_of(final_state: LoopState, remembers: bool) -> Differentiable:
     """What has derivatives of the final state of a loop, of the solver's state what steps depend
     on."""
+    found = Differentiable.of(final_state)
+    return found._replace(solver_state=memory_of(found.solver_state) if remembers else None)
 
-    ts: list[Any]
-    ys: list[Any]
-    dense_ts: Any
-    dense_infos: Any
-    event_dense_info: Any
-    state: State
 
-    @staticmethod
-    def of(final_state: LoopState, remembers: bool) -> "SolveOutputs":
-        of = Differentiable.of(final_state)
-        memory = memory_of(of.solver_state) if remembers else None
-        dense = of.dense_ts, of.dense_infos, of.event_dense_info
-        return SolveOutputs(of.ts, of.ys, *dense, State(of.y, memory))
-
-    def put_into(self, final_state: LoopState) -> LoopState:
-        y, memory = self.state
-        solver_state = Differentiable.of(final_state).solver_state
-        if memory is not None:
-            solver_state = with_memory(solver_state, memory)
-        dense = self.dense_ts, self.dense_infos, self.event_dense_info
-        return Differentiable(self.ts, self.ys, *dense, y, solver_state).put_into(final_state)
+def with_outputs(final_state: LoopState, outputs: Differentiable) -> LoopState:
+    given = Differentiable.of(final_state).solver_state
+    memory = outputs.solver_state
+    solver_state = given if memory is None else with_memory(given, memory)
+    return outputs._replace(solver_state=solver_state).put_into(final_state)
