@@ -12,7 +12,7 @@ from jax import lax
 from . import lane_structure as structure
 from .lane_arithmetic import apply, ELEMENTWISE, elementwise
 from .lane_arrays import Lanes, NotScalarError
-from .lane_value import columns_of_values, Layout, object_array, Value
+from .lane_value import Columns, object_array, Value, where
 from .trace import called, example, unrolled_scan, walk
 
 
@@ -130,28 +130,23 @@ def _while_loop(lanes: Lanes, equation: Any, values: list[Value]) -> list[Value]
     params = equation.params
     m, n = params["cond_nconsts"], params["body_nconsts"]
     entering = lambda values: [value.entering(lanes) for value in values]
-    cond_consts, body_consts, start = (
-        entering(values[:m]),
-        entering(values[m : m + n]),
-        values[m + n :],
-    )
-    layout, columns = Layout.of(start), columns_of_values(start, lanes)
+    cond_consts, body_consts = entering(values[:m]), entering(values[m : m + n])
+    columns = Columns.of_values(values[m + n :], lanes)
 
-    def goes_on(columns: list[jax.Array]) -> jax.Array:
-        values = [*entering(cond_consts), *layout.values(columns)]
-        return columns_of_values(evaluate(lanes, params["cond_jaxpr"], values), lanes)[0]
+    def goes_on(columns: Columns) -> jax.Array:
+        values = [*entering(cond_consts), *columns.values()]
+        return evaluate(lanes, params["cond_jaxpr"], values)[0].columns(lanes)[0]
 
-    def body(carry: tuple[jax.Array, list[jax.Array]]) -> tuple[jax.Array, list[jax.Array]]:
+    def body(carry: tuple[jax.Array, Columns]) -> tuple[jax.Array, Columns]:
         active, columns = carry
         with lanes.inside():
-            values = [*entering(body_consts), *layout.values(columns)]
-            new = columns_of_values(evaluate(lanes, params["body_jaxpr"], values), lanes)
-            columns = [lax.select(active, a, b) for a, b in zip(new, columns, strict=True)]
+            values = [*entering(body_consts), *columns.values()]
+            new = Columns.of_values(evaluate(lanes, params["body_jaxpr"], values), lanes)
+            columns = where(active, new, columns)
             return active & goes_on(columns), columns
 
     start = goes_on(columns), columns
-    _, columns = lax.while_loop(lambda carry: jnp.any(carry[0]), body, start)
-    return layout.values(columns)
+    return lax.while_loop(lambda carry: jnp.any(carry[0]), body, start)[1].values()
 
 
 _CONTROL = {

@@ -56,7 +56,7 @@ def over_devices(
     def solve_share(common: Any, each: Any) -> EnsembleSolution:
         equations, rest = eqx.combine(common, static)
         own = dataclasses.replace(batch, each=each, common=rest, size=share)
-        return solve((equations, own), mesh.axis_names)
+        return solve(Inputs(equations, own), mesh.axis_names)
 
     shared = PartitionSpec(mesh.axis_names)
     solution = jax.shard_map(

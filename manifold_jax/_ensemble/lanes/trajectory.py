@@ -83,6 +83,7 @@ class Equations(eqx.Module):
     dt0: RealScalarLike | None
     adjoint: dfx.AbstractAdjoint
     max_steps: int = eqx.field(static=True)
+    lanes: int = eqx.field(static=True)  # how many trajectories advance together
     consistent: Consistent = eqx.field(static=True)
 
     def begin(self, given: Given) -> Start:
