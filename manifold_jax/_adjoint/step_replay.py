@@ -15,6 +15,7 @@ from .._base.compat import (
     nondifferentiable,
     Progress,
     save_states,
+    SaveState,
     while_loop,
 )
 from .._base.derivative_rule import apply_linear, ForwardRule
@@ -210,7 +211,6 @@ def _gradient(differentiable, perturbed, values, bars):
     if jtu.tree_leaves(beside):
         raise RuntimeError(_TWICE_BACKWARDS)
     replay, start, (t0, t1, ts), run = differentiable
-    counts = [(s.ts, s.saveat_ts_index) for s in save_states(final_state)]
     end = Progress.of(final_state)
     bar = with_zeros(eqx.filter(outputs, eqx.is_inexact_array), given)
     ends = Ends(t0, t1, end.tprev, end.num_steps, end.num_accepted_steps, end.y)
@@ -219,7 +219,7 @@ def _gradient(differentiable, perturbed, values, bars):
         bar.dense_infos if jtu.tree_leaves(given.dense_infos) else None,
         bar.event_dense_info if jtu.tree_leaves(given.event_dense_info) else None,
     )
-    saved = SavedValues(functions, ends, _rows(replay, counts, bar, ends))
+    saved = SavedValues(functions, ends, _rows(replay, save_states(final_state), bar, ends))
     back = ReverseSweep(functions, record, start, ends, saved, dense)
     last_bar = State(bar.y, bar.solver_state)
     gradient = back.run(last_bar, timed=any(jtu.tree_leaves(perturbed[2])))
@@ -230,16 +230,14 @@ def _gradient(differentiable, perturbed, values, bars):
     return gradient.leaves, gradient.state, tuple(times), eqx.filter(run, lambda leaf: False)
 
 
-def _rows(replay: Replay, counts: list[Any], bar: Differentiable, ends: Ends) -> list[Rows]:
-    """Return the saved rows of each saving, with the cotangents of its values; `counts` are times
-    and how many of those that were asked for were reached."""
+def _rows(replay: Replay, saved: list[SaveState], bar: Differentiable, ends: Ends) -> list[Rows]:
+    """Return the saved rows of each saving, with the cotangents of its values."""
     rows = []
-    each = zip(replay.savings, counts, bar.ts, bar.ys, strict=True)
-    for saving, (times, reached), ts_bar, ys_bar in each:
-        count = saving.offset + reached
+    for saving, state, *bars in zip(replay.savings, saved, bar.ts, bar.ys, strict=True):
+        count = jnp.asarray(saving.offset + state.saveat_ts_index)
         if saving.steps:
             count += ends.num_accepted // saving.steps
-        rows.append(Rows(times, count, ts_bar, ys_bar))
+        rows.append(Rows(state.ts, count, *bars))
     return rows
 
 

@@ -11,11 +11,13 @@ import equinox as eqx
 import jax.numpy as jnp
 import jax.tree_util as jtu
 from diffrax import RESULTS
+from jax import lax
+from jaxtyping import Array
 
 from ..._base.compat import directed, is_okay, nonlinear_failure, update_result
 from ..._base.rejection import result_of_state
 from ..._base.types import Args, BoolScalar, FloatScalar, IntScalar, RealScalarLike, Y
-from ..._solve.prepare import prepare, Ready
+from ..._solve.prepare import prepare
 from ..._solve.start import Consistent
 from ..._solve.times import is_time_missing
 from ..._solver.step.advance import HookState, StepStatistics
@@ -41,6 +43,7 @@ class Given(NamedTuple):
     t1: FloatScalar
     y0: Y
     args: Args
+    end_floor: FloatScalar  # see `end_floor`; where time increases
 
     @property
     def direction(self) -> FloatScalar:
@@ -87,7 +90,11 @@ class Equations(eqx.Module):
     consistent: Consistent = eqx.field(static=True)
 
     def begin(self, given: Given) -> Start:
-        solver, args, ready = self.solver, given.args, self._ready(given)
+        solver, args = self.solver, given.args
+        times, settings = (given.t0, given.t1, self.dt0), (self.saveat, self.controller)
+        ready = prepare(
+            self.terms, solver, *times, given.y0, args, *settings, self.consistent, throw=False
+        )
         terms, direction = self._directed(given)
         t0, t1 = ready.t0 * direction, ready.t1 * direction
         dt0 = None if ready.dt0 is None else ready.dt0 * direction
@@ -109,25 +116,9 @@ class Equations(eqx.Module):
         )
         return Start(trajectory, ready.start.correction)
 
-    def _ready(self, given: Given) -> Ready:
-        solver, (t0, t1, y0, args) = self.solver, given
-        return prepare(
-            self.terms,
-            solver,
-            t0,
-            t1,
-            self.dt0,
-            y0,
-            args,
-            self.saveat,
-            self.controller,
-            self.consistent,
-            throw=False,
-        )
-
     def goes_on(self, given: Given, trajectory: Trajectory) -> BoolScalar:
         before = trajectory.tprev < given.t1 * given.direction
-        return before & self._successful(trajectory) & (trajectory.num_steps < self.max_steps)
+        return before & is_okay(trajectory.result) & (trajectory.num_steps < self.max_steps)
 
     def attempt(self, given: Given, trajectory: Trajectory) -> Attempt:
         terms, direction = self._directed(given)
@@ -137,21 +128,15 @@ class Equations(eqx.Module):
             terms, before.tprev, end, before.y, given.args, before.solver_state, False
         )
         error = jtu.tree_map(lambda x: jnp.where(jnp.isnan(x), jnp.inf, x), error)
-        kept, tprev, tnext, _, controller_state, result = self.controller.wrap(
-            direction
-        ).adapt_step_size(
-            before.tprev,
-            end,
-            before.y,
-            y,
-            given.args,
-            error,
-            solver.error_order(terms),
-            before.controller_state,
+        controller, of_step = self.controller.wrap(direction), (before.tprev, end, before.y, y)
+        kept, tprev, tnext, _, controller_state, result = controller.adapt_step_size(
+            *of_step, given.args, error, solver.error_order(terms), before.controller_state
         )
         kept = jnp.asarray(kept)
         tprev = jnp.minimum(tprev, t1)
-        tnext = _clipped(tprev, tnext, t1, kept)  # pyright: ignore[reportArgumentType]
+        # A step that ends just short of the end would leave one of a few rounding errors.
+        last = jnp.where(kept, t1, tprev + 0.5 * (t1 - tprev))
+        tnext = jnp.where(tnext > given.end_floor, last, tnext)
         keep = lambda a, b: jnp.where(kept, a, b)
         result = update_result(RESULTS.where(kept, solver_result, RESULTS.successful), result)
         after = Trajectory(
@@ -186,30 +171,23 @@ class Equations(eqx.Module):
 
     def outcome(self, given: Given, trajectory: Trajectory) -> Outcome:
         result = trajectory.result
-        unfinished = (trajectory.tprev < given.t1 * given.direction) & self._successful(trajectory)
+        unfinished = (trajectory.tprev < given.t1 * given.direction) & is_okay(result)
         result = RESULTS.where(unfinished, RESULTS.max_steps_reached, result)
         result = update_result(result, trajectory.solver_state.result)
         t = trajectory.tprev * given.direction
-        return Outcome(
-            t,
-            trajectory.y,
-            result,
-            trajectory.num_steps,
-            trajectory.num_accepted,
-            trajectory.solver_state.statistics,
-        )
-
-    def _successful(self, trajectory: Trajectory) -> BoolScalar:
-        return is_okay(trajectory.result)
+        counts = trajectory.num_steps, trajectory.num_accepted
+        return Outcome(t, trajectory.y, result, *counts, trajectory.solver_state.statistics)
 
     def _directed(self, given: Given) -> tuple[Any, FloatScalar]:
         return directed(self.terms, given.direction), given.direction
 
 
-def _clipped(
-    tprev: FloatScalar, tnext: FloatScalar, t1: FloatScalar, kept: BoolScalar
-) -> FloatScalar:
-    """Not just short of the end, where a step of a few rounding errors would be left."""
-    floor = t1 - 50 * jnp.finfo(t1.dtype).eps * jnp.abs(t1)
-    end = jnp.where(kept, t1, tprev + 0.5 * (t1 - tprev))
-    return jnp.where(tnext > floor, end, tnext)
+def end_floor(t0: Array, t1: Array) -> Array:
+    """The hundredth number below `t1`, where time increases: steps that would end beyond it end at
+    `t1`, as in `diffrax.diffeqsolve`. Numbers are counted as the integers of their bits."""
+    end = lax.stop_gradient(jnp.where(t0 < t1, t1, -t1))
+    tiny = jnp.finfo(end.dtype).tiny  # smaller numbers are zero to XLA
+    first = jnp.where(end == 0, -tiny, jnp.nextafter(end, -jnp.inf))
+    bits = lax.bitcast_convert_type(first, f"int{8 * end.dtype.itemsize}")
+    bits = jnp.where(first > 0, bits - 99, bits + 99)
+    return lax.bitcast_convert_type(bits, end.dtype)
