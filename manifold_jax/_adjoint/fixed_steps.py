@@ -47,9 +47,8 @@ def event_of_controller(
         return None
 
     def wrap(cond_fn: Callable) -> Callable:
-        return lambda *args, **kwargs: cond_fn(
-            *args, **{**kwargs, "stepsize_controller": controller}
-        )
+        own = {"stepsize_controller": controller}
+        return lambda *args, **kwargs: cond_fn(*args, **kwargs | own)
 
     cond_fn = jtu.tree_map(wrap, event.cond_fn, is_leaf=callable)
     return dfx.Event(cond_fn, event.root_finder, event.direction)

@@ -47,7 +47,7 @@ class Replay(eqx.Module):
     @staticmethod
     def build(solve: "Solve", saveat: dfx.SaveAt, t: Array, start: State, dense: bool) -> "Replay":
         """`t` and `start` are examples; `dense` says whether `dense_info` is asked for itself."""
-        subs = jtu.tree_leaves(saveat.subs, is_leaf=lambda x: isinstance(x, dfx.SubSaveAt))
+        subs = subs_of(saveat)
         interpolates = dense or any(sub.ts is not None for sub in subs)
 
         def step(start, end, jumped, state):
@@ -115,6 +115,10 @@ class Solve(NamedTuple):
             terms, start, end, y, args, solver_state, jumped
         )
         return State(y1, memory_of(solver_state)), dense_info
+
+
+def subs_of(saveat: dfx.SaveAt) -> list[dfx.SubSaveAt]:
+    return jtu.tree_leaves(saveat.subs, is_leaf=lambda x: isinstance(x, dfx.SubSaveAt))
 
 
 def memory_of(solver_state: Any) -> Any:

@@ -59,9 +59,8 @@ class ReverseSweep(eqx.Module):
 
     def _no_times(self) -> TimesBar:
         zero = jnp.zeros_like(self.ends.t0)
-        savings = self.functions.rest.savings
-        of = lambda saving: jnp.zeros(saving.num_times, zero.dtype) if saving.num_times else None
-        return TimesBar(zero, zero, [of(saving) for saving in savings])
+        counts = (saving.num_times for saving in self.functions.rest.savings)
+        return TimesBar(zero, zero, [jnp.zeros(n, zero.dtype) if n else None for n in counts])
 
     def _steps_of_segment(self, i: IntScalar) -> Step:
         """Leading axes: blocks, steps."""

@@ -22,7 +22,7 @@ from .._base.derivative_rule import apply_linear, ForwardRule
 from .fixed_steps import event_of_controller, SizesHeldFixed, with_end_held_fixed
 from .gradient import Ends, TimesBar, with_zeros
 from .record import Record, recording
-from .replay import outputs_of, Replay, Solve, State, with_outputs
+from .replay import outputs_of, Replay, Solve, State, subs_of, with_outputs
 from .reverse_sweep import DenseBars, ReverseSweep
 from .saved import Functions, Rows, SavedValues
 
@@ -102,7 +102,7 @@ class StepReplayAdjoint(dfx.AbstractAdjoint):
                 "`adjoint=StepReplayAdjoint()` cannot repeat the steps of an `UnsafeBrownianPath`. Use a "
                 "`VirtualBrownianTree`, or `adjoint=diffrax.ForwardMode()`."
             )
-        times = t0, t1, [sub.ts for sub in _subs(saveat)]
+        times = t0, t1, [sub.ts for sub in subs_of(saveat)]
         dt0 = nondifferentiable(dt0, msg=_NO_STEP_SIZES)
 
         def run(outer_while_loop):
@@ -247,7 +247,3 @@ def _with_loops(solver: Any, kind: str) -> Any:
     if getattr(solver, "scan_kind", "none") is not None:
         return solver
     return eqx.tree_at(lambda s: s.scan_kind, solver, kind, is_leaf=lambda x: x is None)
-
-
-def _subs(saveat: dfx.SaveAt) -> list[dfx.SubSaveAt]:
-    return jtu.tree_leaves(saveat.subs, is_leaf=lambda x: isinstance(x, dfx.SubSaveAt))

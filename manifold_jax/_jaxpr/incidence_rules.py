@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from .primitives import ELEMENTWISE, evaluated, MOVES, sources, VANISHING
+from .primitives import arranged_factors, ELEMENTWISE, evaluated, MOVES, sources, VANISHING
 
 
 class Value(NamedTuple):
@@ -127,26 +127,12 @@ def _cumulated(equation: Any, values: list[Value]) -> list[Value]:
 
 def _contracted(equation: Any, values: list[Value]) -> list[Value]:
     """A product of arrays, in which some numbers may be zero."""
-    (left, right), (left_batch, right_batch) = equation.params["dimension_numbers"]
-    letters: list[list[int | None]] = [[None] * (value.depends.ndim - 1) for value in values]
-    axes = iter(range(100))
-    for pairs in (zip(left_batch, right_batch, strict=True), zip(left, right, strict=True)):
-        for i, j in pairs:
-            letters[0][i] = letters[1][j] = next(axes)
-    batch = [letters[0][i] for i in left_batch]
-    free = []
-    for names in letters:
-        for i, name in enumerate(names):
-            if name is None:
-                names[i] = next(axes)
-                free.append(names[i])
-    inputs = next(axes)
-    depends = False
-    for k, value in enumerate(values):
-        there = values[1 - k].depends[..., -1].astype(np.float32)
-        own = value.depends.astype(np.float32), [*letters[k], inputs]
-        depends |= np.einsum(*own, there, letters[1 - k], [*batch, *free, inputs]) > 0  # pyright: ignore[reportArgumentType, reportCallIssue]
-    return [Value(np.asarray(depends))]
+    arrays = [value.depends.astype(np.float32) for value in values]
+    a, b = arranged_factors(equation, arrays)
+    depends = np.einsum("bisn,bjs->bijn", a, b[..., -1]) + np.einsum(
+        "bis,bjsn->bijn", a[..., -1], b
+    )
+    return [Value((depends > 0).reshape(*equation.outvars[0].aval.shape, -1))]
 
 
 def _landing(equation: Any, operand: tuple, indices: np.ndarray, update: tuple) -> np.ndarray:

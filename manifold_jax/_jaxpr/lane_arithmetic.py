@@ -4,6 +4,7 @@ Zeros that are known are taken to be exact: `0 x = 0` also where `x` is not fini
 of the structure, as in Jacobians and tableaus.
 """
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -41,14 +42,6 @@ def apply(
     return lanes.apply(primitive, params, dtype, *numbers) if shorter is None else shorter
 
 
-def add(lanes: Lanes, a: Number, b: Number) -> Number:
-    return apply(lanes, lax.add_p, {}, a.dtype, [a, b])
-
-
-def multiply(lanes: Lanes, a: Number, b: Number) -> Number:
-    return apply(lanes, lax.mul_p, {}, a.dtype, [a, b])
-
-
 def _is(x: Number, value: int) -> bool:
     return isinstance(x, np.generic) and bool(x == value)
 
@@ -74,36 +67,22 @@ def _mul(lanes: Lanes, params: Any, a: Number, b: Number) -> Number | None:
     return None
 
 
-def _div(lanes: Lanes, params: Any, a: Number, b: Number) -> Number | None:
-    return a if _is(b, 1) else None
+def _logical(neutral: bool) -> Callable:
+    """`and` (`or`), in which `True` (`False`) changes nothing."""
 
+    def rule(lanes: Lanes, params: Any, a: Number, b: Number) -> Number | None:
+        for x, y in ((a, b), (b, a)):
+            if isinstance(x, np.bool_):
+                return y if x == neutral else x
+        return None
 
-def _and(lanes: Lanes, params: Any, a: Number, b: Number) -> Number | None:
-    for x, y in ((a, b), (b, a)):
-        if isinstance(x, np.bool_):
-            return y if x else x
-    return None
-
-
-def _or(lanes: Lanes, params: Any, a: Number, b: Number) -> Number | None:
-    for x, y in ((a, b), (b, a)):
-        if isinstance(x, np.bool_):
-            return x if x else y
-    return None
+    return rule
 
 
 def _select(lanes: Lanes, params: Any, which: Number, *cases: Number) -> Number | None:
     if isinstance(which, np.generic):
         return cases[int(which)]
     return cases[0] if all(case is cases[0] for case in cases) else None
-
-
-def _same(lanes: Lanes, params: Any, x: Number) -> Number:
-    return x
-
-
-def _converted(lanes: Lanes, params: Any, x: Number) -> Number | None:
-    return x if x.dtype == params["new_dtype"] else None
 
 
 def _power(lanes: Lanes, params: Any, x: Number) -> Number | None:
@@ -117,13 +96,11 @@ _SHORTER = {
     "add_any": _add,
     "sub": _sub,
     "mul": _mul,
-    "div": _div,
-    "and": _and,
-    "or": _or,
+    "div": lambda lanes, params, a, b: a if _is(b, 1) else None,
+    "and": _logical(True),
+    "or": _logical(False),
     "select_n": _select,
-    "copy": _same,
-    "copy_p": _same,
-    "stop_gradient": _same,
-    "convert_element_type": _converted,
+    "convert_element_type": lambda lanes, params, x: x if x.dtype == params["new_dtype"] else None,
     "integer_pow": _power,
+    **dict.fromkeys(("copy", "copy_p", "stop_gradient"), lambda lanes, params, x: x),
 }

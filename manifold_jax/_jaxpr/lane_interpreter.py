@@ -13,6 +13,7 @@ from . import lane_structure as structure
 from .lane_arithmetic import apply, ELEMENTWISE, elementwise
 from .lane_arrays import Lanes, NotScalarError
 from .lane_value import Columns, object_array, Value, where
+from .primitives import MOVES
 from .trace import called, example, unrolled_scan, walk
 
 
@@ -47,20 +48,9 @@ def _evaluated(lanes: Lanes, equation: Any, values: list[Value]) -> list[Value]:
         return evaluate(lanes, inner, values)
     else:
         sizes = (v.aval.size for v in (*equation.outvars, *equation.invars))
-        rule = _rule(name) if max(sizes, default=0) <= _LARGEST_ARRAY else None
+        rule = _RULES.get(name) if max(sizes, default=0) <= _LARGEST_ARRAY else None
         out = None if rule is None else rule(lanes, equation, values)
     return _on_whole_arrays(lanes, equation, values) if out is None else out
-
-
-def _rule(name: str) -> Callable | None:
-    if name in ELEMENTWISE:
-        return elementwise
-    if name in structure.MOVES:
-        return structure.move
-    if name in structure.REDUCTIONS:
-        return structure.reduce
-    others = {"dot_general": structure.dot_general, "iota": structure.iota}
-    return {**others, "platform_index": structure.platform}.get(name)
 
 
 def _on_whole_arrays(lanes: Lanes, equation: Any, values: list[Value]) -> list[Value]:
@@ -149,6 +139,14 @@ def _while_loop(lanes: Lanes, equation: Any, values: list[Value]) -> list[Value]
     return lax.while_loop(lambda carry: jnp.any(carry[0]), body, start)[1].values()
 
 
+_RULES: dict[str, Callable] = {
+    **dict.fromkeys(MOVES, structure.move),
+    **dict.fromkeys(structure.REDUCTIONS, structure.reduce),
+    **dict.fromkeys(ELEMENTWISE, elementwise),
+    "dot_general": structure.dot_general,
+    "iota": structure.iota,
+    "platform_index": structure.platform,
+}
 _CONTROL = {
     "cond": _cond,
     "custom_linear_solve": _linear_solve,

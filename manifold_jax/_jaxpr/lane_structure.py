@@ -8,10 +8,10 @@ import jax
 import numpy as np
 from jax import lax
 
-from .lane_arithmetic import add, apply, multiply
+from .lane_arithmetic import apply
 from .lane_arrays import Lanes, NotScalarError
 from .lane_value import object_array, Value
-from .primitives import evaluated, MOVES as MOVES, sources
+from .primitives import arranged_factors, evaluated, sources
 
 
 def move(lanes: Lanes, equation: Any, values: list[Value]) -> list[Value] | None:
@@ -45,34 +45,25 @@ _LARGEST_DOT = 2000
 
 
 def dot_general(lanes: Lanes, equation: Any, values: list[Value]) -> list[Value] | None:
-    (a_sum, b_sum), (a_batch, b_batch) = equation.params["dimension_numbers"]
     aval = equation.outvars[0].aval
-    length = math.prod(values[0].shape[i] for i in a_sum)
+    length = math.prod(values[0].shape[i] for i in equation.params["dimension_numbers"][0][0])
     if math.prod(aval.shape) * length > _LARGEST_DOT or values[0].dtype != values[1].dtype:
         return None
-    A, batch, a_free = _arranged(values[0], a_batch, a_sum)
-    B, _, b_free = _arranged(values[1], b_batch, b_sum)
+    A, B = arranged_factors(equation, [value.numbers() for value in values])
     zero = np.zeros((), aval.dtype)[()]
 
+    def combine(primitive: Any, *numbers: Any) -> Any:
+        return apply(lanes, primitive, {}, aval.dtype, list(numbers))
+
     def entry(k: int, i: int, j: int) -> Any:
-        products = (multiply(lanes, x, y) for x, y in zip(A[k, i], B[k, j], strict=True))
-        return functools.reduce(lambda s, p: add(lanes, s, p), products, zero)
+        products = map(functools.partial(combine, lax.mul_p), A[k, i], B[k, j])
+        return functools.reduce(functools.partial(combine, lax.add_p), products, zero)
 
-    shape = A.shape[0], A.shape[1], B.shape[1]
-    out = object_array([entry(*index) for index in np.ndindex(*shape)], shape)
-    return [Value.of_numbers(out.reshape((*batch, *a_free, *b_free)), aval.dtype)]
-
-
-def _arranged(value: Value, batch: Any, summed: Any) -> tuple[np.ndarray, list[int], list[int]]:
-    """Arrange a value with axes `(batch, free, summed)`."""
-    x = value.numbers()
-    free = [i for i in range(x.ndim) if i not in (*batch, *summed)]
-    sizes = [[x.shape[i] for i in axes] for axes in (batch, free, summed)]
-    x = np.transpose(x, (*batch, *free, *summed))
-    return x.reshape([math.prod(size) for size in sizes]), sizes[0], sizes[1]
+    indices = np.ndindex(A.shape[0], A.shape[1], B.shape[1])
+    return [Value.of_numbers(object_array([entry(*i) for i in indices], aval.shape), aval.dtype)]
 
 
-_REDUCTIONS = {
+REDUCTIONS = {
     "reduce_sum": lax.add_p,
     "reduce_prod": lax.mul_p,
     "reduce_max": lax.max_p,
@@ -80,11 +71,10 @@ _REDUCTIONS = {
     "reduce_and": lax.and_p,
     "reduce_or": lax.or_p,
 }
-REDUCTIONS = frozenset(_REDUCTIONS)
 
 
 def reduce(lanes: Lanes, equation: Any, values: list[Value]) -> list[Value] | None:
-    primitive, aval = _REDUCTIONS[equation.primitive.name], equation.outvars[0].aval
+    primitive, aval = REDUCTIONS[equation.primitive.name], equation.outvars[0].aval
     if primitive in (lax.and_p, lax.or_p) and aval.dtype != bool:
         return None
     x, axes = values[0].numbers(), equation.params["axes"]

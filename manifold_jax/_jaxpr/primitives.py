@@ -21,15 +21,9 @@ ELEMENTWISE = """
 """.split()
 
 
-def _squeeze(parameters: dict, x: np.ndarray) -> np.ndarray:
-    gone = {axis % x.ndim for axis in parameters["dimensions"]}
-    return x.reshape([size for axis, size in enumerate(x.shape) if axis not in gone])
-
-
 def _slice(parameters: dict, x: np.ndarray) -> np.ndarray:
     strides = parameters["strides"] or (1,) * x.ndim
-    bounds = zip(parameters["start_indices"], parameters["limit_indices"], strides, strict=True)
-    return x[tuple(slice(*bound) for bound in bounds)]
+    return x[tuple(map(slice, parameters["start_indices"], parameters["limit_indices"], strides))]
 
 
 def _reshape(parameters: dict, x: np.ndarray) -> np.ndarray:
@@ -38,10 +32,9 @@ def _reshape(parameters: dict, x: np.ndarray) -> np.ndarray:
 
 
 def _broadcast(parameters: dict, x: np.ndarray) -> np.ndarray:
-    shape = [1] * len(parameters["shape"])
-    for axis, size in zip(parameters["broadcast_dimensions"], x.shape, strict=True):
-        shape[axis] = size
-    return np.broadcast_to(x.reshape(shape), parameters["shape"])
+    shape, own = parameters["shape"], parameters["broadcast_dimensions"]
+    new = tuple(axis for axis in range(len(shape)) if axis not in own)
+    return np.broadcast_to(np.expand_dims(x, new), shape)
 
 
 _MOVED_BY_NUMPY: dict[str, Callable[..., np.ndarray]] = {
@@ -52,7 +45,7 @@ _MOVED_BY_NUMPY: dict[str, Callable[..., np.ndarray]] = {
     "reshape": _reshape,
     "rev": lambda parameters, x: np.flip(x, parameters["dimensions"]),
     "slice": _slice,
-    "squeeze": _squeeze,
+    "squeeze": lambda parameters, x: np.squeeze(x, tuple(parameters["dimensions"])),
     "transpose": lambda parameters, x: x.transpose(parameters["permutation"]),
 }
 _COMPUTED_BY_NUMPY: dict[str, Callable[..., np.ndarray]] = {
@@ -130,3 +123,17 @@ def sources(
     is_gather = equation.primitive.name == "gather"
     params = {**equation.params, "fill_value": -1} if is_gather else equation.params
     return which, evaluated(equation.primitive, params, operands)
+
+
+def arranged_factors(equation: Any, factors: Sequence[np.ndarray]) -> list[np.ndarray]:
+    """The factors of a product of arrays, each with one axis of what is common to both, one of what
+    is its own and one of what is summed over, and further ones that arrays of numbers do not have."""
+    out = []
+    axes = equation.params["dimension_numbers"]
+    for variable, x, summed, batch in zip(equation.invars, factors, *axes, strict=True):
+        ndim = variable.aval.ndim
+        free = [i for i in range(ndim) if i not in (*batch, *summed)]
+        sizes = [math.prod(x.shape[i] for i in group) for group in (batch, free, summed)]
+        x = x.transpose(*batch, *free, *summed, *range(ndim, x.ndim))
+        out.append(x.reshape(*sizes, *x.shape[ndim:]))
+    return out

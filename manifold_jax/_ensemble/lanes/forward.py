@@ -37,11 +37,6 @@ class Moving(NamedTuple):
     tangent: Any
 
 
-class Ended(NamedTuple):
-    outcome: Outcome
-    tangent: Any
-
-
 class Tangents:
     """[`Equations`][] for pairs of what they are for and its tangent, with the same steps."""
 
@@ -95,9 +90,8 @@ class Tangents:
         _, tangent, (value, success) = self._along(save, given, *y, t)
         return (value, tangent), success
 
-    def outcome(self, given: GivenTangent, moving: Moving) -> Ended:
-        outcome = given.equations.outcome(given.given, moving.trajectory)
-        return Ended(outcome, moving.tangent.y)
+    def outcome(self, given: GivenTangent, moving: Moving) -> tuple[Outcome, Any]:
+        return given.equations.outcome(given.given, moving.trajectory), moving.tangent.y
 
 
 def tangents_in_lanes(inputs: Inputs, tangents: Any, limit: int) -> tuple[Any, Any]:
@@ -109,7 +103,7 @@ def tangents_in_lanes(inputs: Inputs, tangents: Any, limit: int) -> tuple[Any, A
     equations = Tangents(parts, along.common)
     given = parts.each, parts.rest_each, along.each
     run = Schedule(equations, given, equations.given, limit).run()
-    start, outcome = run.start.trajectory, run.outcome.outcome
+    start, (outcome, last_tangent) = run.start.trajectory, run.outcome
     values, values_tangent = None, None
     if run.values is not None:
         values, values_tangent = run.values
@@ -117,5 +111,5 @@ def tangents_in_lanes(inputs: Inputs, tangents: Any, limit: int) -> tuple[Any, A
         values_tangent = jtu.tree_map(lambda x: jnp.where(like(reached, x), x, 0), values_tangent)
     saved, smooth = smooth_rows(parts, run.rows, outcome.t, values)
     at = parts.each, parts.common, start.trajectory.y, outcome.y, smooth
-    along = along.each, along.common, start.tangent.y, run.outcome.tangent, values_tangent
+    along = along.each, along.common, start.tangent.y, last_tangent, values_tangent
     return jax.jvp(saved, at, along)[1]

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 from diffrax import RESULTS
+from jaxtyping import Array
 
 from ..._adjoint.gradient import with_zeros
 from ..._base.compat import nonlinear_failure, update_result
@@ -34,7 +35,7 @@ def gradient_in_lanes(
 ) -> Inputs:
     """`bar`: cotangents of times and values; `differentiated`: a tree of truth values."""
     parts = Parts.of(inputs, differentiated)
-    if parts.num_common() > _MOST_IN_COMMON:
+    if sum(x.size for x in jtu.tree_leaves(parts.common)) > _MOST_IN_COMMON:
         raise NotScalarError("too many numbers in common")
     saved, smooth = smooth_rows(parts, run.rows, run.outcome.t, run.values)
     at = parts.each, parts.common, run.start.trajectory.y, run.outcome.y, smooth
@@ -78,17 +79,16 @@ def _run(inputs: Inputs) -> tuple[EnsembleSolution, Run]:
         }
     ends = run.start.trajectory.y, outcome.y
     ts, ys = saved_rows(equations.saveat.subs, batch, run.rows, outcome.t, *ends, run.values)
-    result = jax.vmap(_unless_failed)(outcome.result, run.failed)
-    if not equations.solver.corrects_output:
-        finite = jax.vmap(lambda ts, ys: result_of_saved(equations.saveat, ts, ys))(ts, ys)
-        result = jax.vmap(update_result)(result, finite)
+
+    def with_values(result: RESULTS, failed: BoolScalar, ts: Array, ys: Any) -> RESULTS:
+        failure = RESULTS.where(failed, nonlinear_failure(), RESULTS.successful)
+        result = update_result(result, failure)
+        if equations.solver.corrects_output:
+            return result
+        return update_result(result, result_of_saved(equations.saveat, ts, ys))
+
+    result = jax.vmap(with_values)(outcome.result, run.failed, ts, ys)
     return EnsembleSolution(ts, ys, stats, result), run
-
-
-def _unless_failed(result: RESULTS, failed: BoolScalar) -> RESULTS:
-    """`failed`: whether a value could not be corrected."""
-    failure = RESULTS.where(failed, nonlinear_failure(), RESULTS.successful)
-    return update_result(result, failure)
 
 
 @solve_in_lanes.def_fwd

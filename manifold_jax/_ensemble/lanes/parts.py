@@ -6,8 +6,8 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
-import jax.tree_util as jtu
 
+from ..._adjoint.replay import subs_of
 from .arguments import Batch
 from .trajectory import Equations, Given
 
@@ -52,9 +52,6 @@ class Parts(NamedTuple):
         equations, batch = eqx.combine(common, self.rest)
         return Inputs(equations, dataclasses.replace(batch, each=eqx.combine(each, self.rest_each)))
 
-    def num_common(self) -> int:
-        return sum(x.size for x in jtu.tree_leaves(self.common))
-
 
 def in_steps(equations: Equations) -> Equations:
     """Return the equations with the solver as it is in the loop over steps."""
@@ -65,7 +62,6 @@ def in_steps(equations: Equations) -> Equations:
 def times_are_differentiated(differentiated: Any) -> bool:
     """Whether any of the times, step sizes or tolerances is."""
     equations, batch = differentiated
-    is_sub = lambda x: hasattr(x, "ts")
-    subs = jtu.tree_leaves(equations.saveat.subs, is_leaf=is_sub)
+    subs = subs_of(equations.saveat)
     timed = batch.each[:2], batch.common[:2], equations.dt0, equations.controller
     return any(x is True for x in jax.tree.leaves((timed, [sub.ts for sub in subs])))

@@ -93,16 +93,13 @@ def in_words(faults: list[Fault], chunk: int) -> str:
 
 def _read(path: Path, name: str) -> tuple[dict[str, Any] | None, Fault | None]:
     """A file of JSON, or what is wrong with it."""
+    file = path / name
     try:
-        text = (path / name).read_text(encoding="utf-8")
+        description = json.loads(file.read_text(encoding="utf-8"))
     except (FileNotFoundError, NotADirectoryError):
         return None, Fault(name, "missing")
-    except UnicodeDecodeError:
-        return None, Fault(name, "damaged")
-    try:
-        description = json.loads(text)
-    except ValueError:
-        return None, Fault(name, "damaged" if text else "empty")
+    except ValueError:  # no text, or no JSON
+        return None, Fault(name, "damaged" if file.stat().st_size else "empty")
     if not isinstance(description, dict):
         return None, Fault(name, "damaged")
     return description, None
