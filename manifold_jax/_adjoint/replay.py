@@ -54,9 +54,8 @@ class Replay(eqx.Module):
             after, dense_info = solve.attempt(start, end, jumped, state)
             return after, dense_info if interpolates else None
 
-        convert = convert_closure
         example = t, t, t != t if solve.jumps else False, start
-        step = convert(step, *example)
+        step = convert_closure(step, *example)
         _, dense_info = eqx.filter_eval_shape(step, *example)
 
         def saving(sub: dfx.SubSaveAt) -> Saving:
@@ -67,10 +66,11 @@ class Replay(eqx.Module):
                 interpolation = solve.solver.interpolation_cls(t0=start, t1=end, **dense_info)
                 return at_state(t, interpolation.evaluate(t))
 
-            between = None if sub.ts is None else convert(in_step, t, t, t, dense_info)
+            times = t, t, t
+            between = None if sub.ts is None else convert_closure(in_step, *times, dense_info)
             num_times = 0 if sub.ts is None else len(sub.ts)
             at_end = sub.t1 and sub.steps != 1  # with every step the last row is one of those
-            at_state_ = convert(at_state, t, start.y)
+            at_state_ = convert_closure(at_state, t, start.y)
             return Saving(int(sub.t0), num_times, sub.steps, at_end, at_state_, between)
 
         return Replay(step, [saving(sub) for sub in subs])

@@ -38,14 +38,15 @@ def incidence(function: Callable, *tracked: tuple[Any, np.ndarray]) -> Incidence
     inputs)`."""
     arguments = [argument for argument, _ in tracked]
     closed = jax.make_jaxpr(function)(*arguments)
-    values, number = [], tracked[0][1].shape[1]
-    for argument, inputs in tracked:
-        start = 0
-        for leaf in jax.tree_util.tree_leaves(argument):
-            size, shape = int(np.size(leaf)), np.shape(leaf)
-            depends = inputs[start : start + size].reshape(*shape, number)
-            values.append(Value(np.concatenate([depends, np.ones((*shape, 1), bool)], axis=-1)))
-            start += size
+    inputs = np.concatenate([inputs for _, inputs in tracked])
+    values, number, start = [], inputs.shape[1], 0
+    inputs = np.append(
+        inputs, np.ones((len(inputs), 1), bool), axis=1
+    )  # all may be other than zero
+    for leaf in jax.tree_util.tree_leaves(arguments):
+        end = start + np.size(leaf)
+        values.append(Value(inputs[start:end].reshape(*np.shape(leaf), number + 1)))
+        start = end
     search = Search(number, Counter())
     (out,) = search.through(closed, values)
     return Incidence(out.depends[..., :-1], {k: v for k, v in search.unknown.items() if v})
@@ -108,10 +109,6 @@ def _also(values: list[Value], condition: np.ndarray) -> list[Value]:
     return [Value(value.depends | condition) for value in values]
 
 
-def _forgotten(values: list[Value]) -> list[Value]:
-    return [Value(value.depends) for value in values]
-
-
 def _cond(search: Search, equation: Any, values: list[Value]) -> list[Value]:
     index, *operands = values
     branches = equation.params["branches"]
@@ -122,7 +119,8 @@ def _cond(search: Search, equation: Any, values: list[Value]) -> list[Value]:
 
 def _while(search: Search, equation: Any, values: list[Value]) -> list[Value]:
     n, m = equation.params["cond_nconsts"], equation.params["body_nconsts"]
-    of_condition, of_body, carry = values[:n], values[n : n + m], _forgotten(values[n + m :])
+    of_condition, of_body = values[:n], values[n : n + m]
+    carry = [Value(value.depends) for value in values[n + m :]]  # known numbers are those before
 
     def once(carry: list[Value]) -> list[Value]:
         (condition,) = search.through(equation.params["cond_jaxpr"], of_condition + carry)
@@ -153,7 +151,8 @@ def _long_scan(search: Search, equation: Any, values: list[Value]) -> list[Value
     n, m = scan_counts(equation)
     items = [Value(x.depends.any(axis=0)) for x in values[n + m :]]  # pyright: ignore[reportArgumentType]
     through = lambda carry: search.through(equation.params["jaxpr"], values[:n] + carry + items)
-    carry = _until_unchanged(lambda c: _either(c, through(c)[:m]), _forgotten(values[n : n + m]))
+    carry = [Value(value.depends) for value in values[n : n + m]]
+    carry = _until_unchanged(lambda c: _either(c, through(c)[:m]), carry)
     outputs = [
         Value(np.broadcast_to(value.depends, (*out.aval.shape, search.number + 1)))
         for value, out in zip(through(carry)[m:], equation.outvars[m:], strict=True)

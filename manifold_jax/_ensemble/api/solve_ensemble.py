@@ -129,7 +129,10 @@ def solve_ensemble(
             error.add_note(_example(batch))
             raise
         solution = dataclasses.replace(solution, messages=messages_of(solver))
-        return _raise_if_any_failed(solution, axes) if throw else solution
+        if not throw:
+            return solution
+        number, failed = largest(solution.reasons(), axes), anywhere(solution.failed, axes)
+        return eqx.branched_error_if(solution, failed, number, solution.messages)
 
     inputs = Inputs(equations, batch)
     return solve(inputs) if mesh is None else over_devices(solve, inputs, mesh)
@@ -142,8 +145,3 @@ def _example(batch: Batch) -> str:
         f"Of the {batch.size} trajectories of `y0s` each has a state of shapes {jtu.tree_map(jnp.shape, one.y0)}: the "
         "leading axes are the trajectories. One alone is solved by `mj.diffeqsolve`."
     )
-
-
-def _raise_if_any_failed(solution: EnsembleSolution, axes: Axes) -> EnsembleSolution:
-    number, failed = largest(solution.reasons(), axes), anywhere(solution.failed, axes)
-    return eqx.branched_error_if(solution, failed, number, solution.messages)

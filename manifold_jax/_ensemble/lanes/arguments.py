@@ -42,7 +42,7 @@ class Batch(eqx.Module):
 
     def complete(self, each: Any) -> Given:
         """Return the arguments of one trajectory, from its part of `each`."""
-        given = Given(*eqx.combine(each, self.common))
+        given = eqx.combine(each, self.common)
         t0, t1 = jnp.asarray(given.t0, self.dtype), jnp.asarray(given.t1, self.dtype)
         return given._replace(t0=t0, t1=t1)
 
@@ -59,24 +59,18 @@ def checked_batch(
         raise ValueError(f"`lanes` must be a positive integer, got {lanes!r}.")
     check_state(y0s, "y0s")
     y0s = jtu.tree_map(jnp.asarray, y0s)
-    sizes = {f"y0s{jtu.keystr(path)}": _size(x) for path, x in jtu.tree_leaves_with_path(y0s)}
-    which = jtu.tree_map(lambda _: True, y0s)
     timed = tuple(eqx.is_array(t) and t.ndim > 0 for t in (t0, t1))
-    for name, t, own in zip(("t0", "t1"), (t0, t1), timed, strict=True):
-        if own:
-            sizes[name] = _size(t)
-    axes_of_args = _axes(args_axes, args)
-    for (path, x), own in zip(
-        jtu.tree_leaves_with_path(args), jtu.tree_leaves(axes_of_args), strict=True
-    ):
-        if own:
-            sizes[f"args{jtu.keystr(path)}"] = _size(x)
+    axes = jtu.tree_map(lambda _: True, y0s), _axes(args_axes, args)
+    mask = Given._make((*timed, *axes, any(timed)))
+    own = eqx.filter(Given._make((t0, t1, y0s, args, None)), mask)
+    parts = {"y0s": own.y0, "t0": own.t0, "t1": own.t1, "args": own.args}
+    leaves = [(name, x) for name in parts for x in jtu.tree_leaves_with_path(parts[name])]
+    sizes = {f"{name}{jtu.keystr(path)}": _size(x) for name, (path, x) in leaves}
     _check_sizes(sizes)
     start, end = (t if np.ndim(t) == 0 else t[0] for t in (t0, t1))
     dtype = time_dtype(start, end, dt0, saveat)
-    mask = (*timed, which, axes_of_args, any(timed))
-    full = (t0, t1, y0s, args, end_floor(jnp.asarray(t0, dtype), jnp.asarray(t1, dtype)))
-    each, common = eqx.filter(full, mask), eqx.filter(full, mask, inverse=True)
+    floor = end_floor(jnp.asarray(t0, dtype), jnp.asarray(t1, dtype))
+    each, common = eqx.partition(Given(t0, t1, y0s, args, floor), mask)
     return Batch(each, common, dtype, next(iter(sizes.values())))  # pyright: ignore[reportArgumentType, reportCallIssue]
 
 

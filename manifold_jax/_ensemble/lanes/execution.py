@@ -33,20 +33,16 @@ def solve_on_one_device(inputs: Inputs) -> EnsembleSolution:
     if obstacle is None:
         forwards = isinstance(inputs.equations.adjoint, dfx.ForwardMode)
         solve = solve_in_lanes_forwards if forwards else solve_in_lanes
+        written_out, inner = inputs, inputs.equations.solver.inner
+        if isinstance(inner, AbstractRosenbrock):
+            inner = dataclasses.replace(inner, largest_written_out=LARGEST_STIFF)
+            written_out = inputs.with_solver(Unconstrained(inner))
         try:
-            return solve(_with_written_out_elimination(inputs))
+            return solve(written_out)
         except NotScalarError as error:
             obstacle = str(error)
     execution = f"mapped over, not in lanes: {obstacle}"
     return dataclasses.replace(solve_mapped(inputs), execution=execution)
-
-
-def _with_written_out_elimination(inputs: Inputs) -> Inputs:
-    inner = inputs.equations.solver.inner
-    if not isinstance(inner, AbstractRosenbrock):
-        return inputs
-    inner = dataclasses.replace(inner, largest_written_out=LARGEST_STIFF)
-    return inputs.with_solver(Unconstrained(inner))
 
 
 def _obstacle(inputs: Inputs) -> str | None:

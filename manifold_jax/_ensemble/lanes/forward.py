@@ -94,11 +94,11 @@ class Tangents:
         return given.equations.outcome(given.given, moving.trajectory), moving.tangent.y
 
 
-def tangents_in_lanes(inputs: Inputs, tangents: Any, limit: int) -> tuple[Any, Any]:
+def tangents_in_lanes(
+    inputs: Inputs, differentiated: Any, tangents: Any, limit: int
+) -> tuple[Any, Any]:
     """Return the tangents of times and values; `tangents` of the inputs have `None` where there is
-    none."""
-    is_none = lambda x: x is None
-    differentiated = jtu.tree_map(lambda x: x is not None, tangents, is_leaf=is_none)
+    none; `differentiated`: a tree of truth values."""
     parts, along = Parts.of(inputs, differentiated), Parts.of(tangents, differentiated)
     equations = Tangents(parts, along.common)
     given = parts.each, parts.rest_each, along.each

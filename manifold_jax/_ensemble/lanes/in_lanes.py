@@ -1,6 +1,8 @@
 """Many trajectories in lanes, with their derivatives."""
 
+import contextlib
 import dataclasses
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -100,12 +102,19 @@ def _forward(perturbed, inputs):
 @solve_in_lanes.def_bwd
 def _backward(run, cotangents, perturbed, inputs):
     bar = cotangents.ts, cotangents.ys
-    if not times_are_differentiated(perturbed):
-        try:
-            return gradient_in_lanes(inputs, perturbed, run, bar, _LONGEST_BACK)
-        except NotScalarError:
-            pass
-    return gradient_of_mapped(inputs, perturbed, bar)
+    return _in_lanes_or_mapped(
+        perturbed,
+        lambda: gradient_in_lanes(inputs, perturbed, run, bar, _LONGEST_BACK),
+        lambda: gradient_of_mapped(inputs, perturbed, bar),
+    )
+
+
+def _in_lanes_or_mapped(differentiated: Any, in_lanes: Callable, mapped: Callable) -> Any:
+    """`in_lanes()`, or `mapped()` for derivatives of times, and where lanes would take too long."""
+    if not times_are_differentiated(differentiated):
+        with contextlib.suppress(NotScalarError):
+            return in_lanes()
+    return mapped()
 
 
 @eqx.filter_custom_jvp
@@ -120,14 +129,10 @@ def _tangents(primals, tangents):
     (inputs,), (tangents,) = primals, tangents
     solution, _ = _run(inputs)
     differentiated = jtu.tree_map(lambda x: x is not None, tangents, is_leaf=lambda x: x is None)
-    along = None
-    if not times_are_differentiated(differentiated):
-        try:
-            along = tangents_in_lanes(inputs, tangents, _LONGEST_BACK)
-        except NotScalarError:
-            pass
-    if along is None:
-        along = tangents_of_mapped(inputs, tangents)
-    ts, ys = along
+    along = _in_lanes_or_mapped(
+        differentiated,
+        lambda: tangents_in_lanes(inputs, differentiated, tangents, _LONGEST_BACK),
+        lambda: tangents_of_mapped(inputs, tangents),
+    )
     none = jtu.tree_map(lambda _: None, (solution.stats, solution.result))
-    return solution, EnsembleSolution(ts, ys, *none)
+    return solution, EnsembleSolution(*along, *none)

@@ -19,12 +19,11 @@ def solve_mapped(inputs: Inputs) -> EnsembleSolution:
 
     def one(of_each: Any) -> tuple[Any, ...]:
         given = batch.complete(of_each)
+        times = given.t0, given.t1, equations.dt0
         sol = diffeqsolve(
             equations.terms,
             solver,
-            given.t0,
-            given.t1,
-            equations.dt0,
+            *times,
             given.y0,
             given.args,
             saveat=equations.saveat,

@@ -43,7 +43,7 @@ class Given(NamedTuple):
     t1: FloatScalar
     y0: Y
     args: Args
-    end_floor: FloatScalar  # see `end_floor`; where time increases
+    end_floor: FloatScalar  # see [`end_floor`][]
 
     @property
     def direction(self) -> FloatScalar:
@@ -92,10 +92,10 @@ class Equations(eqx.Module):
     def begin(self, given: Given) -> Start:
         solver, args = self.solver, given.args
         times, settings = (given.t0, given.t1, self.dt0), (self.saveat, self.controller)
-        ready = prepare(
-            self.terms, solver, *times, given.y0, args, *settings, self.consistent, throw=False
-        )
-        terms, direction = self._directed(given)
+        of = *times, given.y0, args, *settings, self.consistent
+        ready = prepare(self.terms, solver, *of, throw=False)
+        direction = given.direction
+        terms = directed(self.terms, direction)
         t0, t1 = ready.t0 * direction, ready.t1 * direction
         dt0 = None if ready.dt0 is None else ready.dt0 * direction
         error_order = solver.error_order(terms)
@@ -121,8 +121,8 @@ class Equations(eqx.Module):
         return before & is_okay(trajectory.result) & (trajectory.num_steps < self.max_steps)
 
     def attempt(self, given: Given, trajectory: Trajectory) -> Attempt:
-        terms, direction = self._directed(given)
-        t1, solver = given.t1 * direction, self.solver
+        solver, direction = self.solver, given.direction
+        terms, t1 = directed(self.terms, direction), given.t1 * direction
         before, end = trajectory, trajectory.tnext
         y, error, dense_info, solver_state, solver_result = solver.step(
             terms, before.tprev, end, before.y, given.args, before.solver_state, False
@@ -177,9 +177,6 @@ class Equations(eqx.Module):
         t = trajectory.tprev * given.direction
         counts = trajectory.num_steps, trajectory.num_accepted
         return Outcome(t, trajectory.y, result, *counts, trajectory.solver_state.statistics)
-
-    def _directed(self, given: Given) -> tuple[Any, FloatScalar]:
-        return directed(self.terms, given.direction), given.direction
 
 
 def end_floor(t0: Array, t1: Array) -> Array:
