@@ -40,9 +40,8 @@ def incidence(function: Callable, *tracked: tuple[Any, np.ndarray]) -> Incidence
     closed = jax.make_jaxpr(function)(*arguments)
     inputs = np.concatenate([inputs for _, inputs in tracked])
     values, number, start = [], inputs.shape[1], 0
-    inputs = np.append(
-        inputs, np.ones((len(inputs), 1), bool), axis=1
-    )  # all may be other than zero
+    # All may be other than zero.
+    inputs = np.append(inputs, np.ones((len(inputs), 1), bool), axis=1)
     for leaf in jax.tree_util.tree_leaves(arguments):
         end = start + np.size(leaf)
         values.append(Value(inputs[start:end].reshape(*np.shape(leaf), number + 1)))
@@ -53,7 +52,7 @@ def incidence(function: Callable, *tracked: tuple[Any, np.ndarray]) -> Incidence
 
 
 class Search(NamedTuple):
-    """Through a traced function, in the order of execution."""
+    """What depends on what, in the order of execution of a traced function."""
 
     number: int  # of inputs
     unknown: Counter
