@@ -104,9 +104,8 @@ def tangents_in_lanes(
     given = parts.each, parts.rest_each, along.each
     run = Schedule(equations, given, equations.given, limit).run()
     start, (outcome, last_tangent) = run.start.trajectory, run.outcome
-    values, values_tangent = None, None
-    if run.values is not None:
-        values, values_tangent = run.values
+    values, values_tangent = run.values or (None, None)
+    if values is not None:
         reached = jnp.arange(equations.saveat.subs.ts.size)[None] < run.rows[:, None]
         values_tangent = jtu.tree_map(lambda x: jnp.where(like(reached, x), x, 0), values_tangent)
     saved, smooth = smooth_rows(parts, run.rows, outcome.t, values)

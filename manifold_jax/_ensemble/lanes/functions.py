@@ -8,7 +8,8 @@ from typing import Any
 
 import equinox as eqx
 
-from ..._adjoint.replay import memory_of, State
+from ..._adjoint.replay import memory_of, Solve, State
+from ..._base.compat import directed
 from ..._base.types import FloatScalar
 from .trajectory import Equations, Given, Trajectory
 
@@ -27,6 +28,17 @@ def begin(equations: Equations, given: Given, x: None) -> tuple[Any, Any]:
     """The state before the first step; and the start."""
     start = equations.begin(given)
     return smooth_part(step_state(start.trajectory)), start
+
+
+def step(
+    equations: Equations, given: Given, smooth: State, rest: State, solver_state: Any, *ends: Any
+) -> tuple[Any, Any]:
+    """The state behind a step and the data of its interpolation; and these data. `solver_state` is
+    one for what is not remembered of it."""
+    terms, (start, end) = directed(equations.terms, given.direction), ends
+    solve = Solve(terms, equations.solver, given.args, solver_state, remembers=True, jumps=False)
+    after, dense_info = solve.attempt(start, end, False, eqx.combine(smooth, rest))
+    return (smooth_part(after), dense_info), dense_info
 
 
 def interpolate(

@@ -15,13 +15,12 @@ from jax import lax
 from jaxtyping import Array
 
 from ..._adjoint.record import rows_backwards
-from ..._adjoint.replay import Solve, State
-from ..._base.compat import directed
+from ..._adjoint.replay import State
 from ..._jaxpr.lane_arrays import Lanes
 from ..._jaxpr.lane_interpreter import call_in_lanes
 from ..._jaxpr.lane_value import Columns, Layout, Value, where
 from .columns import added, read, Stacked, taken
-from .functions import begin, interpolate, save, smooth_part, step_state
+from .functions import begin, interpolate, save, smooth_part, step, step_state
 from .parts import Parts
 from .records import Bars, Ends, Group, Record
 from .trajectory import Equations
@@ -59,9 +58,8 @@ class ReverseSweep:
         index = jnp.full(groups * count, self.size).at[: self.size].set(order)
         start = self._empty_record(), self.no_common
         (_, common), each = lax.scan(self._through_group, start, index.reshape(groups, count))
-        in_order = lambda x: (
-            jnp.zeros_like(x, shape=self.size).at[order].set(x.ravel()[: self.size])
-        )
+        empty = lambda x: jnp.zeros_like(x, shape=self.size)
+        in_order = lambda x: empty(x).at[order].set(x.ravel()[: self.size])
         total = jtu.tree_map(lambda x: jnp.sum(x, keepdims=True), common).arrays()
         return jtu.tree_map(in_order, each).arrays(), jtu.tree_map(lambda x: x[0], total)
 
@@ -138,8 +136,8 @@ class ReverseSweep:
                 num_rows, unfinished, state, record = self._forwards(group, state, record)
                 onwards = onwards & unfinished
                 num_rows = jnp.where(onwards, 0, num_rows)
-                step = lambda bars, step: self._through_step(group, step, bars)
-                bars = rows_backwards(record, num_rows, step, bars)
+                through = lambda bars, step: self._through_step(group, step, bars)
+                bars = rows_backwards(record, num_rows, through, bars)
                 write = lambda x, new: x.at[k + 1].set(new, mode="drop")
                 # The last one is not read again in the reverse sweep.
                 firsts = jtu.tree_map(write, firsts, Stacked.of(state))
@@ -155,7 +153,7 @@ class ReverseSweep:
         def goes_on(state: Columns) -> Array:
             return self._column(Equations.goes_on, group, state.values()) & group.present
 
-        def step(carry: Any) -> Any:
+        def onwards(carry: Any) -> Any:
             row, active, state, record = carry
             with self.lanes.inside(state.columns[0]):
                 before = state.values()
@@ -171,7 +169,7 @@ class ReverseSweep:
         with self.lanes.inside():
             start = jnp.asarray(0), goes_on(state), state, record
         unfinished = lambda carry: (carry[0] < self.rows) & jnp.any(carry[1])
-        row, active, state, record = lax.while_loop(unfinished, step, start)
+        row, active, state, record = lax.while_loop(unfinished, onwards, start)
         return row, jnp.any(active), state, record
 
     def _through_step(self, group: Group, step: Record, bars: Bars) -> Bars:
@@ -191,14 +189,8 @@ class ReverseSweep:
         the state behind it and of these data to those of `each`, `common` and `state`."""
         each, common, rest = given
         smooth, discrete = eqx.partition(state, eqx.is_inexact_array)
-
-        def step(equations: Any, given: Any, smooth: State) -> Any:
-            terms = directed(equations.terms, given.direction)
-            solve = Solve(terms, equations.solver, given.args, self.solver_state, True, False)
-            after, dense_info = solve.attempt(start, end, False, eqx.combine(smooth, discrete))
-            return smooth_part(after), dense_info
-
-        (_, dense_info), pullback = jax.vjp(self.parts.smooth(step, rest), each, common, smooth)
+        value = self.parts.smooth(step, rest, discrete, self.solver_state, start, end)
+        _, pullback, dense_info = jax.vjp(value, each, common, smooth, has_aux=True)
         return dense_info, pullback
 
     def _through_rows(
