@@ -30,6 +30,7 @@ EXACT = {
     "batched": lambda x: jax.vmap(lambda a, b: a @ b)(x.reshape(2, 3), x[::-1].reshape(2, 3)),
     "gradient": lambda x: jax.grad(lambda x: jnp.sum(x[:3] ** 2 * x[3:]))(x),
     "cumulated": jnp.cumsum,
+    "columns first": lambda x: x.reshape(2, 3).ravel(order="F"),
     "rolled": lambda x: jnp.roll(x, 1) / 2,
     "padded": lambda x: jnp.pad(x[:2], (1, 2)) - jnp.tile(x[2:3], 5),
     "crossed": lambda x: jnp.cross(x[:3], x[3:]),

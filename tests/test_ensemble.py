@@ -90,6 +90,19 @@ def test_backwards_with_constant_steps_and_functions():
 
 
 @pytest.mark.usefixtures("only_in_lanes")
+def test_steps_that_end_just_short_of_the_end():
+    """By less than a hundred numbers, before and behind zero: there is no step of what is left."""
+    t0s, t1s = jnp.array([0.0, -2.5, 0.0]), jnp.array([1.25, -1.25, 1.3])
+    dt0, rate = 0.625 - 40 * np.finfo(float).eps, jnp.asarray(2.0)
+    options = dict(stepsize_controller=dfx.PIDController(rtol=1.0, atol=1.0, dtmax=dt0))
+    solver, starts = HOOKS["plain"], STARTS[:3]
+    sol = mj.solve_ensemble(TURN, solver, t0s, t1s, dt0, starts, rate, lanes=LANES, **options)
+    single = jax.jit(jax.vmap(lambda *of: alone(solver, *of[:2], dt0, of[2], rate, **options)))
+    assert_equal(sol, single(t0s, t1s, starts))
+    assert sol.stats["num_steps"].tolist() == [2, 2, 3]
+
+
+@pytest.mark.usefixtures("only_in_lanes")
 def test_a_failure_leaves_the_others_as_they_are():
     hook = HOOKS["projected"]
     solve = jax.jit(

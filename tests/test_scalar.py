@@ -54,9 +54,11 @@ FUNCTIONS = {
     "not finite": lambda x: jnp.log(x) + jnp.where(x > 0, 1 / (x - x), x),
     "products": lambda x: (jnp.outer(x, x) @ x, jnp.einsum("ij,kj->ik", jnp.eye(4), x[None] * 2)),
     "moves": lambda x: (x[::-1], jnp.pad(x, 1)[jnp.array([0, 3])], x.reshape(2, 2).T.ravel()),
+    "columns first": lambda x: x.reshape(2, 2).ravel(order="F"),
     "updates": lambda x: x.at[1].set(7.0).at[jnp.array([0, 2])].set(x[1:3]),
     "added to": lambda x: x.at[jnp.array([0, 0])].add(1.0),  # no rule
     "indices of their own": lambda x: x[jnp.argmax(x)],  # no rule
+    "filled in": lambda x: x.at[jnp.array([0, 9])].get(mode="fill", fill_value=2.0),  # no rule
     "reductions": lambda x: (x.sum(), x.max(), x.prod(), jnp.all(x > 0), jnp.any(x > 1)),
     "branches": lambda x: jax.lax.cond(x[0] > 0, jnp.sin, lambda x: -x, x),
     "several branches": lambda x: jax.lax.switch(
@@ -83,7 +85,7 @@ def test_functions(name):
         assert a.shape == b.shape
         assert a.dtype == b.dtype
         np.testing.assert_allclose(a, b, rtol=1e-13, atol=1e-13)
-    known = {"added to", "indices of their own", "long loop", "solve", "derivatives"}
+    known = {"added to", "indices of their own", "filled in", "long loop", "solve", "derivatives"}
     assert bool(lanes.whole) == (name in known), lanes.whole
 
 

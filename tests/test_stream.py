@@ -226,7 +226,7 @@ def test_a_full_disk(whole, tmp_path, monkeypatch):
         sys.modules["manifold_jax._ensemble.api.stream_ensemble"], "create_arrays", then_full
     )
     try:
-        with pytest.raises(OSError, match=r"cannot write to `out=.*go on with `resume=True`") as e:
+        with pytest.raises(OSError, match=r"cannot write to `path=.*go on with `resume=True`") as e:
             stream(out)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
@@ -240,7 +240,7 @@ def test_a_full_disk(whole, tmp_path, monkeypatch):
 def test_a_folder_that_cannot_be_made(tmp_path):
     (tmp_path / "file").write_text("")
     for out in (tmp_path / "file", tmp_path / "file" / "below"):
-        with pytest.raises(OSError, match=r"cannot write to `out="):
+        with pytest.raises(OSError, match=r"cannot write to `path="):
             stream(out)
 
 

@@ -22,7 +22,7 @@ from .._base.compat import (
     unvmap_any,
     update_result,
 )
-from .._base.types import Args, BoolScalar, FloatScalar, IntScalar, Y
+from .._base.types import BoolScalar, FloatScalar, IntScalar, Y
 from .._linalg.newton import root_of_step
 from .._solver.base import AbstractManifoldSolver
 
@@ -37,31 +37,31 @@ class LocatingAdjoint(dfx.AbstractAdjoint):
 
     adjoint: dfx.AbstractAdjoint
 
-    def loop(
-        self, *, event: Any, saveat: dfx.SaveAt, solver: Any, terms: Any, args: Args, **kwargs: Any
-    ) -> Any:
-        given = dict(saveat=saveat, solver=solver, terms=terms)
-        final_state, statistics = self.adjoint.loop(
-            event=dfx.Event(event.cond_fn, None, event.direction), args=args, **given, **kwargs
-        )
-        names = "t0", "t1", "dt0", "stepsize_controller", "max_steps"
-        given |= {name: kwargs[name] for name in names}
+    def loop(self, *, event: Any, **given: Any) -> Any:
+        unlocated = dfx.Event(event.cond_fn, None, event.direction)
+        final_state, statistics = self.adjoint.loop(event=unlocated, **given)
         progress, old = Progress.of(final_state), Ending.of(final_state)
-        last_step = _EventsInStep(event, LastStep.of(final_state), args, given)
+        last_step = _EventsInStep(event, LastStep.of(final_state), given)
         located = last_step.happened & (progress.num_steps > 0)
         new = lax.cond(
             unvmap_any(located),
-            lambda: _ending(old, progress.num_accepted_steps, last_step, located, saveat),
+            lambda: _ending(old, progress.num_accepted_steps, last_step, located),
             lambda: old,
         )
         return new.put_into(final_state), statistics
 
 
+# What Diffrax passes to an event function by name, besides time, state and `args`.
+EVENT_KEYWORDS = ("saveat", "solver", "terms", "t0", "t1", "dt0", "stepsize_controller")
+EVENT_KEYWORDS += ("max_steps",)
+
+
 class _EventsInStep:
     """The step in which a solve ended, and the events in it."""
 
-    def __init__(self, event: dfx.Event, step: LastStep, args: Args, given: dict[str, Any]):
-        self.args, self.given, self.root_finder = args, given, event.root_finder
+    def __init__(self, event: dfx.Event, step: LastStep, given: dict[str, Any]):
+        self.args, self.root_finder = given["args"], event.root_finder
+        self.given = {name: given[name] for name in EVENT_KEYWORDS}
         self.events = jtu.tree_leaves(event.cond_fn, is_leaf=callable)
         self.directions = jtu.tree_leaves(event.direction, is_leaf=lambda x: x is None)
         self.after = [jnp.asarray(v) for v in jtu.tree_leaves(step.values)]
@@ -137,11 +137,7 @@ class _EventsInStep:
 
 
 def _ending(
-    old: Ending,
-    num_accepted: IntScalar,
-    last_step: _EventsInStep,
-    located: BoolScalar,
-    saveat: dfx.SaveAt,
+    old: Ending, num_accepted: IntScalar, last_step: _EventsInStep, located: BoolScalar
 ) -> Ending:
     """How the solve ends with its first event, where there is one."""
     t, first, found = last_step.first()
@@ -154,7 +150,8 @@ def _ending(
         return _saved_until(sub, state, num_accepted, (t, value), (empty, jnp.inf))  # pyright: ignore[reportArgumentType]
 
     is_sub = lambda x: isinstance(x, dfx.SubSaveAt)
-    save_state = jtu.tree_map(saved, saveat.subs, old.save_state, is_leaf=is_sub)
+    subs = last_step.given["saveat"].subs
+    save_state = jtu.tree_map(saved, subs, old.save_state, is_leaf=is_sub)
     result = RESULTS.where(found == RESULTS.successful, old.result, found)
     new = Ending(mask, save_state, result)
     return jtu.tree_map(lambda a, b: jnp.where(located, a, b), new, old)

@@ -1,7 +1,6 @@
 """Forward mode of a solve with the steps that were made, as reverse mode has it: where steps end is
 held fixed, but for the end of the solve."""
 
-from collections.abc import Callable
 from typing import Any
 
 import diffrax as dfx
@@ -46,10 +45,7 @@ def event_of_controller(
     if event is None:
         return None
 
-    def wrap(cond_fn: Callable) -> Callable:
-        return lambda *args, **kwargs: cond_fn(
-            *args, **{**kwargs, "stepsize_controller": controller}
-        )
-
+    own = {"stepsize_controller": controller}
+    wrap = lambda cond_fn: lambda *args, **kwargs: cond_fn(*args, **kwargs | own)
     cond_fn = jtu.tree_map(wrap, event.cond_fn, is_leaf=callable)
     return dfx.Event(cond_fn, event.root_finder, event.direction)

@@ -27,58 +27,48 @@ class Step(NamedTuple):
 
     start: Float[Array, "*steps"]
     end: Float[Array, "*steps"]
-    jumped: Bool[Array, "*steps"] | bool
+    jumped: Bool[Array, "*steps"] | None  # if steps may begin behind jumps
     accepted: Bool[Array, "*steps"]
     state: Vectors  # from which it was made
+
+    @property
+    def begins_at_jump(self) -> Bool[Array, "*steps"] | bool:
+        return False if self.jumped is None else self.jumped
 
 
 class TimesBar(NamedTuple):
     """Cotangents with respect to the ends of the solve and to the times of `SaveAt(ts=...)`. The
-    ends of all
-    other steps are what they are."""
+    ends of all other steps are what they are."""
 
     t0: FloatScalar
     t1: FloatScalar
     ts: list[Float[Array, " times"] | None]
 
+    def at_ends_of_step(self, ends: Ends, step: Step, start_bar: Any, end_bar: Any) -> "TimesBar":
+        t0 = self.t0 + jnp.where(step.start == ends.t0, start_bar, 0)
+        return self._replace(t0=t0, t1=self.t1 + jnp.where(step.end == ends.t1, end_bar, 0))
+
+    def at_end_of_solve(self, ends: Ends, t: Any, bar: FloatScalar) -> "TimesBar":
+        """A value saved at `t`, if that is one of the ends."""
+        at_start = t == ends.t0
+        t0 = self.t0 + jnp.where(at_start, bar, 0)
+        return self._replace(t0=t0, t1=self.t1 + jnp.where((t == ends.t1) & ~at_start, bar, 0))
+
+    def at_saved_time(self, k: int, i: IntScalar, bar: FloatScalar) -> "TimesBar":
+        of_saving = self.ts[k]
+        assert of_saving is not None
+        return self._replace(ts=replaced(self.ts, k, of_saving.at[i].add(bar)))
+
 
 class Gradient(NamedTuple):
     """Cotangents with respect to the state behind accepted step `number`, to the leaves of the
-    functions and
-    to times so far; `rows` are the last rows of each saving still to come."""
+    functions and to times so far; `rows` are the last rows of each saving still to come."""
 
     number: IntScalar
     rows: list[IntScalar]
     state: State
     leaves: Any
     times: TimesBar | None  # if they have derivatives
-
-    def at_ends_of_step(self, ends: Ends, step: Step, times_bar: Any) -> "Gradient":
-        if times_bar is None:
-            return self
-        start_bar, end_bar = times_bar
-        bars = self.times
-        assert bars is not None
-        t0 = bars.t0 + jnp.where(step.start == ends.t0, start_bar, 0)
-        t1 = bars.t1 + jnp.where(step.end == ends.t1, end_bar, 0)
-        return self._replace(times=bars._replace(t0=t0, t1=t1))
-
-    def at_end_of_solve(self, ends: Ends, t: Any, bar: FloatScalar) -> "Gradient":
-        """A value saved at `t`, if that is one of the ends."""
-        bars = self.times
-        assert bars is not None
-        at_start = t == ends.t0
-        t0 = bars.t0 + jnp.where(at_start, bar, 0)
-        t1 = bars.t1 + jnp.where((t == ends.t1) & ~at_start, bar, 0)
-        return self._replace(times=bars._replace(t0=t0, t1=t1))
-
-    def at_saved_time(self, k: int, i: IntScalar, bar: FloatScalar) -> "Gradient":
-        bars = self.times
-        assert bars is not None
-        of_saving = bars.ts[k]
-        assert of_saving is not None
-        ts = replaced(bars.ts, k, of_saving.at[i].add(bar))
-        return self._replace(times=bars._replace(ts=ts))
 
 
 def add(a: Any, b: Any) -> Any:
@@ -87,3 +77,8 @@ def add(a: Any, b: Any) -> Any:
 
 def replaced(items: list, k: int, item: Any) -> list:
     return [*items[:k], item, *items[k + 1 :]]
+
+
+def with_zeros(values: Any, bars: Any) -> Any:
+    """Cotangents of `values`, zero instead of `None` where there are none."""
+    return jtu.tree_map(lambda x, bar: jnp.zeros_like(x) if bar is None else bar, values, bars)

@@ -128,6 +128,25 @@ class Record(eqx.Module):
         return Record(times, states, firsts, self.packing, sizes)  # pyright: ignore[reportArgumentType]
 
 
+def counted_down(count: IntScalar, through: Callable, carry: Any) -> Any:
+    """`through(carry, i)` for all `i` from `count - 1` down to 0."""
+    once = lambda state: (state[0] - 1, through(state[1], state[0] - 1))
+    return lax.while_loop(lambda state: state[0] > 0, once, (count, carry))[1]
+
+
+def rows_backwards(rows: Any, count: IntScalar, through: Callable, carry: Any) -> Any:
+    """`through(carry, row)` for the first `count` rows of arrays, beginning with the last one."""
+    # Fetched one step ahead: XLA would copy the slices into every kernel that needs them.
+    fetched = lambda i: jtu.tree_map(lambda x: x[jnp.maximum(i, 0)], rows)
+
+    def once(state: Any) -> Any:
+        i, carry, row = state
+        return i - 1, through(carry, row), fetched(i - 1)
+
+    start = count - 1, carry, fetched(count - 1)
+    return lax.while_loop(lambda state: state[0] >= 0, once, start)[1]
+
+
 def recording(record: Record, of: Callable[[Any], Any], run: Callable) -> tuple[Any, Record]:
     """`run(while_loop)` with `while_loop` as Diffrax's outer loop, and what it recorded of
     the states `of(loop state)`."""

@@ -47,16 +47,15 @@ class Replay(eqx.Module):
     @staticmethod
     def build(solve: "Solve", saveat: dfx.SaveAt, t: Array, start: State, dense: bool) -> "Replay":
         """`t` and `start` are examples; `dense` says whether `dense_info` is asked for itself."""
-        subs = jtu.tree_leaves(saveat.subs, is_leaf=lambda x: isinstance(x, dfx.SubSaveAt))
+        subs = subs_of(saveat)
         interpolates = dense or any(sub.ts is not None for sub in subs)
 
         def step(start, end, jumped, state):
             after, dense_info = solve.attempt(start, end, jumped, state)
             return after, dense_info if interpolates else None
 
-        convert = convert_closure
         example = t, t, t != t if solve.jumps else False, start
-        step = convert(step, *example)
+        step = convert_closure(step, *example)
         _, dense_info = eqx.filter_eval_shape(step, *example)
 
         def saving(sub: dfx.SubSaveAt) -> Saving:
@@ -67,10 +66,11 @@ class Replay(eqx.Module):
                 interpolation = solve.solver.interpolation_cls(t0=start, t1=end, **dense_info)
                 return at_state(t, interpolation.evaluate(t))
 
-            between = None if sub.ts is None else convert(in_step, t, t, t, dense_info)
+            times = t, t, t
+            between = None if sub.ts is None else convert_closure(in_step, *times, dense_info)
             num_times = 0 if sub.ts is None else len(sub.ts)
             at_end = sub.t1 and sub.steps != 1  # with every step the last row is one of those
-            at_state_ = convert(at_state, t, start.y)
+            at_state_ = convert_closure(at_state, t, start.y)
             return Saving(int(sub.t0), num_times, sub.steps, at_end, at_state_, between)
 
         return Replay(step, [saving(sub) for sub in subs])
@@ -117,6 +117,10 @@ class Solve(NamedTuple):
         return State(y1, memory_of(solver_state)), dense_info
 
 
+def subs_of(saveat: dfx.SaveAt) -> list[dfx.SubSaveAt]:
+    return jtu.tree_leaves(saveat.subs, is_leaf=lambda x: isinstance(x, dfx.SubSaveAt))
+
+
 def memory_of(solver_state: Any) -> Any:
     """Return the memory of a hook without its statistics, which no step depends on."""
     return solver_state.memory if isinstance(solver_state, HookState) else solver_state
@@ -139,28 +143,15 @@ def may_jump(controller: Any, made_jump: Any) -> bool:
     return not isinstance(controller, known)
 
 
-class SolveOutputs(NamedTuple):
+def outputs_of(final_state: LoopState, remembers: bool) -> Differentiable:
     """What has derivatives of the final state of a loop, of the solver's state what steps depend
     on."""
+    found = Differentiable.of(final_state)
+    return found._replace(solver_state=memory_of(found.solver_state) if remembers else None)
 
-    ts: list[Any]
-    ys: list[Any]
-    dense_ts: Any
-    dense_infos: Any
-    event_dense_info: Any
-    state: State
 
-    @staticmethod
-    def of(final_state: LoopState, remembers: bool) -> "SolveOutputs":
-        of = Differentiable.of(final_state)
-        memory = memory_of(of.solver_state) if remembers else None
-        dense = of.dense_ts, of.dense_infos, of.event_dense_info
-        return SolveOutputs(of.ts, of.ys, *dense, State(of.y, memory))
-
-    def put_into(self, final_state: LoopState) -> LoopState:
-        y, memory = self.state
-        solver_state = Differentiable.of(final_state).solver_state
-        if memory is not None:
-            solver_state = with_memory(solver_state, memory)
-        dense = self.dense_ts, self.dense_infos, self.event_dense_info
-        return Differentiable(self.ts, self.ys, *dense, y, solver_state).put_into(final_state)
+def with_outputs(final_state: LoopState, outputs: Differentiable) -> LoopState:
+    given = Differentiable.of(final_state).solver_state
+    memory = outputs.solver_state
+    solver_state = given if memory is None else with_memory(given, memory)
+    return outputs._replace(solver_state=solver_state).put_into(final_state)

@@ -3,7 +3,6 @@
 from typing import Any, NamedTuple
 
 import equinox as eqx
-import jax
 import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
@@ -11,8 +10,8 @@ import jax.tree_util as jtu
 from .._base.compat import unvmap_max
 from .._base.types import IntScalar
 from .gradient import add, Ends, Gradient, Step, TimesBar
-from .record import Record, Vectors
-from .replay import State
+from .record import counted_down, Record, rows_backwards, Vectors
+from .replay import Replay, State
 from .saved import Functions, SavedValues
 
 
@@ -52,22 +51,16 @@ class ReverseSweep(eqx.Module):
             self._no_times() if timed else None,
         )
         gradient = self.saved.through_end(gradient)
-        total = unvmap_max(self.ends.num_steps)
-
-        def through_segment(carry):
-            i, gradient = carry
-            return i - 1, self._through_segment(gradient, i - 1, total)
-
-        sizes = self.record.sizes
-        start = -(-total // (sizes.segment * sizes.block)), gradient
-        _, gradient = lax.while_loop(lambda carry: carry[0] > 0, through_segment, start)
+        total, sizes = unvmap_max(self.ends.num_steps), self.record.sizes
+        segments = -(-total // (sizes.segment * sizes.block))
+        through = lambda gradient, i: self._through_segment(gradient, i, total)
+        gradient = counted_down(segments, through, gradient)
         return self.saved.through_start(gradient, self.first.y)
 
     def _no_times(self) -> TimesBar:
         zero = jnp.zeros_like(self.ends.t0)
-        savings = self.functions.rest.savings
-        of = lambda saving: jnp.zeros(saving.num_times, zero.dtype) if saving.num_times else None
-        return TimesBar(zero, zero, [of(saving) for saving in savings])
+        counts = (saving.num_times for saving in self.functions.rest.savings)
+        return TimesBar(zero, zero, [jnp.zeros(n, zero.dtype) if n else None for n in counts])
 
     def _steps_of_segment(self, i: IntScalar) -> Step:
         """Leading axes: blocks, steps."""
@@ -78,7 +71,7 @@ class ReverseSweep(eqx.Module):
         # Rows of no accepted step hold one of no length from the first state: functions may refuse
         # what is not a state or time.
         start, end = (jnp.where(accepted, times[..., i], self.ends.t0) for i in range(2))
-        jumped = accepted & (times[..., 2] > 0) if record.jumps else False
+        jumped = accepted & (times[..., 2] > 0) if record.jumps else None
         times = start, end, jumped, accepted
         last = max(sizes.kept // sizes.segment - 1, 0)
         kept = lambda: {k: part(x, jnp.minimum(i, last)) for k, x in record.states.items()}
@@ -96,59 +89,40 @@ class ReverseSweep(eqx.Module):
     def _states_again(self, i: IntScalar, steps: Step) -> Vectors:
         """The states of a segment, computed from its first one."""
         record, packing = self.record, self.record.packing
-        arrays, static = eqx.partition(steps, eqx.is_array)
 
         def advance(x, step):
-            step = eqx.combine(step, static)
-            state = packing.unpack(x)
-            new, _ = self.functions.replay.step(step.start, step.end, step.jumped, state)
+            of = step.start, step.end, step.begins_at_jump, packing.unpack(x)
+            new, _ = self.functions.replay.step(*of)
             new = packing.pack(new)
             return {k: jnp.where(step.accepted, new[k], x[k]) for k in x}, x
 
         begun = i * (record.sizes.segment * record.sizes.block) < self.ends.num_steps
         first = packing.pack(self.first)
         first = {k: jnp.where(begun, x[i], first[k]) for k, x in record.firsts.items()}
-        states = lax.scan(advance, first, jtu.tree_map(jnp.ravel, arrays))[1]
+        states = lax.scan(advance, first, jtu.tree_map(jnp.ravel, steps))[1]
         return {k: x.reshape(*steps.start.shape, -1) for k, x in states.items()}
 
     def _through_segment(self, gradient: Gradient, i: IntScalar, total: IntScalar) -> Gradient:
-        sizes = self.record.sizes
-        blocks, static = eqx.partition(self._steps_of_segment(i), eqx.is_array)
+        sizes, blocks = self.record.sizes, self._steps_of_segment(i)
         begun = total - i * (sizes.segment * sizes.block)  # steps
 
-        def through_block(carry):
-            j, gradient = carry
-            steps = eqx.combine(jtu.tree_map(lambda x: x[j - 1], blocks), static)
-            num_steps = jnp.minimum(begun - (j - 1) * sizes.block, sizes.block)
-            return j - 1, self._through_block(gradient, steps, num_steps)
+        def through_block(gradient: Gradient, j: IntScalar) -> Gradient:
+            steps = jtu.tree_map(lambda x: x[j], blocks)
+            num_steps = jnp.minimum(begun - j * sizes.block, sizes.block)
+            return rows_backwards(steps, num_steps, self._through_step, gradient)
 
-        start = jnp.minimum(-(-begun // sizes.block), sizes.segment), gradient
-        return lax.while_loop(lambda carry: carry[0] > 0, through_block, start)[1]
-
-    def _through_block(self, gradient: Gradient, steps: Step, num_steps: IntScalar) -> Gradient:
-        # Fetched one step ahead: XLA would copy the slices into every kernel that needs them.
-        arrays, static = eqx.partition(steps, eqx.is_array)
-        fetched = lambda j: jtu.tree_map(lambda x: x[jnp.maximum(j, 0)], arrays)
-
-        def through_step(carry):
-            j, gradient, step = carry
-            return j - 1, self._through_step(gradient, eqx.combine(step, static)), fetched(j - 1)
-
-        start = num_steps - 1, gradient, fetched(num_steps - 1)
-        return lax.while_loop(lambda carry: carry[0] >= 0, through_step, start)[1]
+        count = jnp.minimum(-(-begun // sizes.block), sizes.segment)
+        return counted_down(count, through_block, gradient)
 
     def _through_step(self, gradient: Gradient, step: Step) -> Gradient:
         state = self.record.packing.unpack(step.state)
         smooth, discrete = eqx.partition(state, eqx.is_inexact_array)
 
-        def value(leaves: Any, smooth: State, times: Any) -> tuple[State, Any]:
-            start, end = (step.start, step.end) if times is None else times
-            x = eqx.combine(smooth, discrete)
-            out = self.functions.at(leaves).step(start, end, step.jumped, x)
-            return eqx.filter(out, eqx.is_inexact_array)
+        def out(replay: Replay, smooth: State, ends: Any) -> tuple[State, Any]:
+            return replay.step(*ends, step.begins_at_jump, eqx.combine(smooth, discrete))
 
-        times = None if gradient.times is None else (step.start, step.end)
-        (after, dense_info), pullback = jax.vjp(value, self.functions.leaves, smooth, times)
+        times, ends = gradient.times, (step.start, step.end)
+        (after, dense_info), pullback = self.functions.vjp(out, smooth, ends, times is not None)
         new = gradient
         for k in range(len(self.functions.rest.savings)):
             new = self.saved.behind_step(new, k, step, after.y)
@@ -156,8 +130,10 @@ class ReverseSweep(eqx.Module):
         bar = self.dense.of(gradient.number, self.ends.num_accepted, zero)
         for k in range(len(self.functions.rest.savings)):
             new, bar = self.saved.inside_step(new, k, step, dense_info, bar)
-        leaves_bar, state_bar, times_bar = pullback((new.state, bar))
-        new = new.at_ends_of_step(self.ends, step, times_bar)
+        leaves_bar, state_bar, ends_bar = pullback((new.state, bar))
+        times = new.times
+        if times is not None:
+            times = times.at_ends_of_step(self.ends, step, *ends_bar)
         leaves = add(new.leaves, leaves_bar)
-        new = new._replace(number=new.number - 1, state=state_bar, leaves=leaves)
+        new = Gradient(new.number - 1, new.rows, state_bar, leaves, times)
         return jtu.tree_map(lambda a, b: jnp.where(step.accepted, a, b), new, gradient)

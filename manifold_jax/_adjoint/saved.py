@@ -1,5 +1,6 @@
 """The reverse sweep through saved values: to the states, steps and times that they are functions of."""
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -26,6 +27,16 @@ class Functions(eqx.Module):
 
     def at(self, leaves: Any) -> Replay:
         return eqx.combine(leaves, self.rest)
+
+    def vjp(self, function: Callable, x: Any, times: Any, timed: bool) -> tuple[Any, Callable]:
+        """Return the real numbers of `function(replay, x, times)`, and what takes their cotangents
+        to those of the leaves, of `x` and, if `timed`, of `times`."""
+
+        def value(leaves: Any, x: Any, moved: Any) -> Any:
+            out = function(self.at(leaves), x, times if moved is None else moved)
+            return eqx.filter(out, eqx.is_inexact_array)
+
+        return jax.vjp(value, self.leaves, x, times if timed else None)
 
 
 class Rows(NamedTuple):
@@ -81,18 +92,14 @@ class SavedValues(eqx.Module):
         self, gradient: Gradient, k: int, t: Any, y: Y, bar: Any, t_bar: FloatScalar
     ) -> Gradient:
         """What saving `k` saves of a state."""
-
-        def value(leaves: Any, y: Y, time: Any) -> Any:
-            saved = self.functions.at(leaves).savings[k].at_state(t if time is None else time, y)
-            return eqx.filter(saved, eqx.is_inexact_array)
-
-        _, pullback = jax.vjp(
-            value, self.functions.leaves, y, None if gradient.times is None else t
-        )
+        saved, times = lambda replay, y, t: replay.savings[k].at_state(t, y), gradient.times
+        _, pullback = self.functions.vjp(saved, y, t, times is not None)
         leaves_bar, y_bar, more = pullback(bar)
+        if times is not None:
+            times = times.at_end_of_solve(self.ends, t, t_bar + more)
         state = gradient.state._replace(y=add(gradient.state.y, y_bar))
-        gradient = gradient._replace(state=state, leaves=add(gradient.leaves, leaves_bar))
-        return gradient if more is None else gradient.at_end_of_solve(self.ends, t, t_bar + more)
+        leaves = add(gradient.leaves, leaves_bar)
+        return gradient._replace(state=state, leaves=leaves, times=times)
 
     def behind_step(self, gradient: Gradient, k: int, step: Step, y: Y) -> Gradient:
         """The row of the state behind a step, if it was saved."""
@@ -103,9 +110,8 @@ class SavedValues(eqx.Module):
         # The time that was saved is that behind a jump at which the step ended.
         t = jnp.where(saved, rows.times[row], step.end)
         bar = jtu.tree_map(lambda b: jnp.where(saved, b[row], 0), rows.values_bar)
-        gradient = self._through_value(
-            gradient, k, t, y, bar, jnp.where(saved, rows.times_bar[row], 0)
-        )
+        t_bar = jnp.where(saved, rows.times_bar[row], 0)
+        gradient = self._through_value(gradient, k, t, y, bar, t_bar)
         return gradient._replace(rows=replaced(gradient.rows, k, row - jnp.where(saved, 1, 0)))
 
     def inside_step(
@@ -123,34 +129,27 @@ class SavedValues(eqx.Module):
             t = rows.times[row]
             # A time at the start of a step is saved at the end of the one before, from which only
             # a jump separates it.
-            inside = first | (t > step.start) | ((t == step.start) & step.jumped)
+            inside = first | (t > step.start) | ((t == step.start) & step.begins_at_jump)
             return step.accepted & (row >= saving.offset) & inside
 
         def through_row(carry):
             gradient, dense_bar = carry
             row = gradient.rows[k]
 
-            def value(leaves: Any, dense_info: Any, times: Any) -> Any:
-                t, start, end = times or (rows.times[row], step.start, step.end)
-                saved = self.functions.at(leaves).savings[k].in_step(t, start, end, dense_info)  # pyright: ignore[reportOptionalCall]
-                return eqx.filter(saved, eqx.is_inexact_array)
-
-            times = (rows.times[row], step.start, step.end)
-            times = None if gradient.times is None else times
+            saved = lambda replay, info, times: replay.savings[k].in_step(*times, info)
+            times, of_times = gradient.times, (rows.times[row], step.start, step.end)
             bar = jtu.tree_map(lambda b: b[row], rows.values_bar)
-            leaves_bar, more, times_bar = jax.vjp(value, self.functions.leaves, dense_info, times)[
-                1
-            ](bar)
-            gradient = gradient._replace(
-                rows=replaced(gradient.rows, k, row - 1), leaves=add(gradient.leaves, leaves_bar)
-            )
-            if times_bar is not None:
-                t_bar, *times_bar = times_bar
-                t_bar = t_bar + rows.times_bar[row]
+            _, pullback = self.functions.vjp(saved, dense_info, of_times, times is not None)
+            leaves_bar, more, times_bar = pullback(bar)
+            if times is not None:
+                t_bar, *ends_bar = times_bar
                 of_steps = (gradient.number - 1) // saving.steps if saving.steps else 0
                 i = row - saving.offset - of_steps
-                gradient = gradient.at_saved_time(k, i, t_bar)
-                gradient = gradient.at_ends_of_step(self.ends, step, times_bar)
+                times = times.at_saved_time(k, i, t_bar + rows.times_bar[row])
+                times = times.at_ends_of_step(self.ends, step, *ends_bar)
+            following = replaced(gradient.rows, k, row - 1)
+            leaves = add(gradient.leaves, leaves_bar)
+            gradient = gradient._replace(rows=following, leaves=leaves, times=times)
             return gradient, add(dense_bar, more)
 
         return lax.while_loop(is_inside, through_row, (gradient, bar))

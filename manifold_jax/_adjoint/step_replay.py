@@ -9,18 +9,20 @@ import jax.tree_util as jtu
 
 from .._base.closure import convert_closure
 from .._base.compat import (
+    Differentiable,
     diffrax_loop,
     is_unsafe_sde,
     nondifferentiable,
     Progress,
     save_states,
+    SaveState,
     while_loop,
 )
 from .._base.derivative_rule import apply_linear, ForwardRule
 from .fixed_steps import event_of_controller, SizesHeldFixed, with_end_held_fixed
-from .gradient import Ends, TimesBar
+from .gradient import Ends, TimesBar, with_zeros
 from .record import Record, recording
-from .replay import Replay, Solve, SolveOutputs
+from .replay import outputs_of, Replay, Solve, State, subs_of, with_outputs
 from .reverse_sweep import DenseBars, ReverseSweep
 from .saved import Functions, Rows, SavedValues
 
@@ -92,18 +94,15 @@ class StepReplayAdjoint(dfx.AbstractAdjoint):
         max_steps,
         event,
         init_state,
-        throw,
-        passed_solver_state,
-        passed_controller_state,
         progress_meter,
+        **_: Any,
     ) -> Any:
-        del throw, passed_solver_state, passed_controller_state
         if is_unsafe_sde(terms):
             raise ValueError(
                 "`adjoint=StepReplayAdjoint()` cannot repeat the steps of an `UnsafeBrownianPath`. Use a "
                 "`VirtualBrownianTree`, or `adjoint=diffrax.ForwardMode()`."
             )
-        times = t0, t1, [sub.ts for sub in _subs(saveat)]
+        times = t0, t1, [sub.ts for sub in subs_of(saveat)]
         dt0 = nondifferentiable(dt0, msg=_NO_STEP_SIZES)
 
         def run(outer_while_loop):
@@ -141,8 +140,8 @@ class StepReplayAdjoint(dfx.AbstractAdjoint):
         # What the functions close over becomes their leaves, which have derivatives.
         forward = convert_closure(forward, record)
         differentiable = replay, start, times, forward
-        (final_state, statistics), saved_value, _ = _solve(differentiable, record, solve.remembers)
-        return saved_value.put_into(final_state), statistics
+        (final_state, statistics), outputs, _ = _solve(differentiable, record, solve.remembers)
+        return with_outputs(final_state, outputs), statistics
 
 
 _NO_STEP_SIZES = (
@@ -168,7 +167,7 @@ def _solve(differentiable, record, remembers):
     """What the loop returns, what has derivatives of that, and what reverse mode needs."""
     *_, run = differentiable
     (state, statistics), record = run(record)
-    return (state, statistics), SolveOutputs.of(state, remembers), (record, state)
+    return (state, statistics), outputs_of(state, remembers), (record, state)
 
 
 @_solve.define_jvp
@@ -188,7 +187,7 @@ def _solve_jvp(values, primals, tangents):
 
         def final(run):
             (state, _), record = run(empty)
-            values = SolveOutputs.of(state, remembers), (record, state)
+            values = outputs_of(state, remembers), (record, state)
             return eqx.filter(values, eqx.is_inexact_array)
 
         return eqx.filter_jvp(final, (differentiable[-1],), (along,))[1]
@@ -205,52 +204,40 @@ def _solve_jvp(values, primals, tangents):
 
 
 def _gradient(differentiable, perturbed, values, bars):
-    _, saved_value, (record, final_state) = values
+    _, outputs, (record, final_state) = values
     given, beside = bars
     if record is None:
         raise RuntimeError(_UNBOUNDED)
     if jtu.tree_leaves(beside):
         raise RuntimeError(_TWICE_BACKWARDS)
     replay, start, (t0, t1, ts), run = differentiable
-    counts = [(s.ts, s.saveat_ts_index) for s in save_states(final_state)]
     end = Progress.of(final_state)
-    bar = jtu.tree_map(
-        lambda x, b: jnp.zeros_like(x) if b is None else b,
-        eqx.filter(saved_value, eqx.is_inexact_array),
-        given,
-    )
+    bar = with_zeros(eqx.filter(outputs, eqx.is_inexact_array), given)
     ends = Ends(t0, t1, end.tprev, end.num_steps, end.num_accepted_steps, end.y)
     functions = Functions(*eqx.partition(replay, perturbed[0]))
-    back = ReverseSweep(
-        functions,
-        record,
-        start,
-        ends,
-        SavedValues(functions, ends, _rows(replay, counts, bar, ends)),
-        DenseBars(
-            bar.dense_infos if jtu.tree_leaves(given.dense_infos) else None,
-            bar.event_dense_info if jtu.tree_leaves(given.event_dense_info) else None,
-        ),
+    dense = DenseBars(
+        bar.dense_infos if jtu.tree_leaves(given.dense_infos) else None,
+        bar.event_dense_info if jtu.tree_leaves(given.event_dense_info) else None,
     )
-    gradient = back.run(bar.state, timed=any(jtu.tree_leaves(perturbed[2])))
+    saved = SavedValues(functions, ends, _rows(replay, save_states(final_state), bar, ends))
+    back = ReverseSweep(functions, record, start, ends, saved, dense)
+    last_bar = State(bar.y, bar.solver_state)
+    gradient = back.run(last_bar, timed=any(jtu.tree_leaves(perturbed[2])))
     times = gradient.times or TimesBar(None, None, [None] * len(ts))  # pyright: ignore[reportArgumentType]
     if gradient.times is not None and bar.dense_ts is not None:
-        at = lambda t: jnp.sum(jnp.where(saved_value.dense_ts == t, bar.dense_ts, 0))
+        at = lambda t: jnp.sum(jnp.where(outputs.dense_ts == t, bar.dense_ts, 0))
         times = times._replace(t0=times.t0 + at(t0), t1=times.t1 + at(t1))
     return gradient.leaves, gradient.state, tuple(times), eqx.filter(run, lambda leaf: False)
 
 
-def _rows(replay: Replay, counts: list[Any], bar: SolveOutputs, ends: Ends) -> list[Rows]:
-    """Return the saved rows of each saving, with the cotangents of its values; `counts` are times
-    and how many of those
-    that were asked for were reached."""
+def _rows(replay: Replay, saved: list[SaveState], bar: Differentiable, ends: Ends) -> list[Rows]:
+    """Return the saved rows of each saving, with the cotangents of its values."""
     rows = []
-    each = zip(replay.savings, counts, bar.ts, bar.ys, strict=True)
-    for saving, (times, reached), ts_bar, ys_bar in each:
-        count = saving.offset + reached
+    for saving, state, *bars in zip(replay.savings, saved, bar.ts, bar.ys, strict=True):
+        count = jnp.asarray(saving.offset + state.saveat_ts_index)
         if saving.steps:
             count += ends.num_accepted // saving.steps
-        rows.append(Rows(times, count, ts_bar, ys_bar))
+        rows.append(Rows(state.ts, count, *bars))
     return rows
 
 
@@ -260,7 +247,3 @@ def _with_loops(solver: Any, kind: str) -> Any:
     if getattr(solver, "scan_kind", "none") is not None:
         return solver
     return eqx.tree_at(lambda s: s.scan_kind, solver, kind, is_leaf=lambda x: x is None)
-
-
-def _subs(saveat: dfx.SaveAt) -> list[dfx.SubSaveAt]:
-    return jtu.tree_leaves(saveat.subs, is_leaf=lambda x: isinstance(x, dfx.SubSaveAt))

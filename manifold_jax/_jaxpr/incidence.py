@@ -14,10 +14,10 @@ from typing import Any, NamedTuple
 import jax
 import jax.core
 import numpy as np
-from jax.extend import core
 
 from .._base.compat import scan_counts
 from .incidence_rules import known_value, RULES, union, Value
+from .trace import called, unrolled_scan, walk
 
 
 # Iterations of a scan that are walked through one by one, so that counters are known.
@@ -34,47 +34,31 @@ class Incidence(NamedTuple):
 
 def incidence(function: Callable, *tracked: tuple[Any, np.ndarray]) -> Incidence:
     """Return the incidence of `function(*arguments)`, which returns one vector. For each argument,
-    a pytree of arrays,
-    the inputs as which its numbers count: a bool array of shape `(numbers, inputs)`."""
+    a pytree of arrays, the inputs as which its numbers count: a bool array of shape `(numbers,
+    inputs)`."""
     arguments = [argument for argument, _ in tracked]
     closed = jax.make_jaxpr(function)(*arguments)
-    values, number = [], tracked[0][1].shape[1]
-    for argument, inputs in tracked:
-        start = 0
-        for leaf in jax.tree_util.tree_leaves(argument):
-            size, shape = int(np.size(leaf)), np.shape(leaf)
-            depends = inputs[start : start + size].reshape(*shape, number)
-            values.append(Value(np.concatenate([depends, np.ones((*shape, 1), bool)], axis=-1)))
-            start += size
-    walk = Walk(number, Counter())
-    (out,) = walk.through(closed, values)
-    return Incidence(out.depends[..., :-1], {k: v for k, v in walk.unknown.items() if v})
+    inputs = np.concatenate([inputs for _, inputs in tracked])
+    values, number, start = [], inputs.shape[1], 0
+    # All may be other than zero.
+    inputs = np.append(inputs, np.ones((len(inputs), 1), bool), axis=1)
+    for leaf in jax.tree_util.tree_leaves(arguments):
+        end = start + np.size(leaf)
+        values.append(Value(inputs[start:end].reshape(*np.shape(leaf), number + 1)))
+        start = end
+    search = Search(number, Counter())
+    (out,) = search.through(closed, values)
+    return Incidence(out.depends[..., :-1], {k: v for k, v in search.unknown.items() if v})
 
 
-class Walk(NamedTuple):
-    """Through a traced function, in the order of execution."""
+class Search(NamedTuple):
+    """What depends on what, in the order of execution of a traced function."""
 
     number: int  # of inputs
     unknown: Counter
 
-    def through(self, closed: Any, inputs: Sequence[Value]) -> list[Value]:
-        jaxpr, constants = (
-            (closed.jaxpr, closed.consts) if hasattr(closed, "consts") else (closed, ())
-        )
-        environment: dict[Any, Value] = {}
-
-        def read(variable: Any) -> Value:
-            if isinstance(variable, core.Literal):
-                return self._known(variable.val)
-            return environment[variable]
-
-        for variable, constant in zip(jaxpr.constvars, constants, strict=True):
-            environment[variable] = self._known(constant)
-        environment.update(zip(jaxpr.invars, inputs, strict=True))
-        for equation in jaxpr.eqns:
-            results = self._equation(equation, [read(v) for v in equation.invars])
-            environment.update(zip(equation.outvars, results, strict=True))
-        return [read(variable) for variable in jaxpr.outvars]
+    def through(self, function: Any, inputs: Sequence[Value]) -> list[Value]:
+        return walk(function, inputs, self._known, self._equation)
 
     def _known(self, constant: Any) -> Value:
         try:
@@ -88,7 +72,7 @@ class Walk(NamedTuple):
 
     def _equation(self, equation: Any, values: list[Value]) -> list[Value]:
         name = equation.primitive.name
-        inner = _called(equation) if name not in _CONTROL else None
+        inner = called(equation) if name not in _CONTROL else None
         if inner is not None and not name.startswith("custom_vjp"):
             return self.through(inner, values)
         constant = all(value.is_constant for value in values)
@@ -113,17 +97,6 @@ class Walk(NamedTuple):
         return [Value(np.broadcast_to(everything, shape)) for shape in shapes]
 
 
-def _called(equation: Any) -> Any:
-    """The function that an equation applies to exactly its operands, if that is what it does."""
-    shapes = lambda variables: [variable.aval.shape for variable in variables]
-    inner = [p for p in equation.params.values() if isinstance(p, core.Jaxpr | core.ClosedJaxpr)]
-    if len(inner) != 1:
-        return None
-    jaxpr = getattr(inner[0], "jaxpr", inner[0])
-    same = shapes(jaxpr.invars) == shapes(equation.invars)
-    return inner[0] if same and shapes(jaxpr.outvars) == shapes(equation.outvars) else None
-
-
 def _either(*alternatives: list[Value]) -> list[Value]:
     return [
         Value(functools.reduce(np.logical_or, [value.depends for value in values]))
@@ -135,25 +108,22 @@ def _also(values: list[Value], condition: np.ndarray) -> list[Value]:
     return [Value(value.depends | condition) for value in values]
 
 
-def _forgotten(values: list[Value]) -> list[Value]:
-    return [Value(value.depends) for value in values]
-
-
-def _cond(walk: Walk, equation: Any, values: list[Value]) -> list[Value]:
+def _cond(search: Search, equation: Any, values: list[Value]) -> list[Value]:
     index, *operands = values
     branches = equation.params["branches"]
     if index.known is not None:
-        return walk.through(branches[int(np.clip(index.known, 0, len(branches) - 1))], operands)
-    return _also(_either(*(walk.through(b, operands) for b in branches)), union([index]))
+        return search.through(branches[int(np.clip(index.known, 0, len(branches) - 1))], operands)
+    return _also(_either(*(search.through(b, operands) for b in branches)), union([index]))
 
 
-def _while(walk: Walk, equation: Any, values: list[Value]) -> list[Value]:
+def _while(search: Search, equation: Any, values: list[Value]) -> list[Value]:
     n, m = equation.params["cond_nconsts"], equation.params["body_nconsts"]
-    of_condition, of_body, carry = values[:n], values[n : n + m], _forgotten(values[n + m :])
+    of_condition, of_body = values[:n], values[n : n + m]
+    carry = [Value(value.depends) for value in values[n + m :]]  # known numbers are those before
 
     def once(carry: list[Value]) -> list[Value]:
-        (condition,) = walk.through(equation.params["cond_jaxpr"], of_condition + carry)
-        after = walk.through(equation.params["body_jaxpr"], of_body + carry)
+        (condition,) = search.through(equation.params["cond_jaxpr"], of_condition + carry)
+        after = search.through(equation.params["body_jaxpr"], of_body + carry)
         return _also(_either(carry, after), union([condition]))
 
     return _until_unchanged(once, carry)
@@ -167,35 +137,23 @@ def _until_unchanged(once: Callable, carry: list[Value]) -> list[Value]:
         carry = after
 
 
-def _scan(walk: Walk, equation: Any, values: list[Value]) -> list[Value]:
-    parameters = equation.params
-    (n, m), length = scan_counts(equation), parameters["length"]
-    constants, carry, xs = values[:n], values[n : n + m], values[n + m :]
-    if not 0 < length <= _MOST_ITERATIONS:
-        return _long_scan(walk, equation, constants, carry, xs)
-    order = range(length)[::-1] if parameters["reverse"] else range(length)
-    outputs: list[list[Value]] = [[]] * length
-    for i in order:
-        items = [Value(x.depends[i], None if x.known is None else x.known[i]) for x in xs]
-        after = walk.through(parameters["jaxpr"], [*constants, *carry, *items])
-        carry, outputs[i] = after[:m], after[m:]
-    stacked = [
-        Value(np.stack([value.depends for value in column]))
-        for column in zip(*outputs, strict=True)
-    ]
-    return carry + stacked
+def _scan(search: Search, equation: Any, values: list[Value]) -> list[Value]:
+    if not 0 < equation.params["length"] <= _MOST_ITERATIONS:
+        return _long_scan(search, equation, values)
+    item = lambda x, i: Value(x.depends[i], None if x.known is None else x.known[i])
+    stack = lambda rows, aval: Value(np.stack([row.depends for row in rows]))
+    return unrolled_scan(equation, values, search.through, item, stack)
 
 
-def _long_scan(
-    walk: Walk, equation: Any, constants: list[Value], carry: list[Value], xs: list[Value]
-) -> list[Value]:
+def _long_scan(search: Search, equation: Any, values: list[Value]) -> list[Value]:
     """All iterations alike."""
-    items = [Value(x.depends.any(axis=0)) for x in xs]  # pyright: ignore[reportArgumentType]
-    through = lambda carry: walk.through(equation.params["jaxpr"], constants + carry + items)
-    m = len(carry)
-    carry = _until_unchanged(lambda c: _either(c, through(c)[:m]), _forgotten(carry))
+    n, m = scan_counts(equation)
+    items = [Value(x.depends.any(axis=0)) for x in values[n + m :]]  # pyright: ignore[reportArgumentType]
+    through = lambda carry: search.through(equation.params["jaxpr"], values[:n] + carry + items)
+    carry = [Value(value.depends) for value in values[n : n + m]]
+    carry = _until_unchanged(lambda c: _either(c, through(c)[:m]), carry)
     outputs = [
-        Value(np.broadcast_to(value.depends, (*out.aval.shape, walk.number + 1)))
+        Value(np.broadcast_to(value.depends, (*out.aval.shape, search.number + 1)))
         for value, out in zip(through(carry)[m:], equation.outvars[m:], strict=True)
     ]
     return carry + outputs

@@ -1,19 +1,22 @@
 """What the results of one primitive depend on, number by number."""
 
 import functools
+import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
+from jax import lax
 
-from .incidence_moves import bind, landing, move, MOVES, num_moved
+from .primitives import arranged_factors, ELEMENTWISE, evaluated, MOVES, sources, VANISHING
 
 
 class Value(NamedTuple):
     """What is known of an array of shape `S`: the inputs its numbers depend on, shape `(*S, inputs
-    + 1)`, and the
-    numbers themselves if they are constants. Behind the inputs stands whether a number may be
-    other than zero: for sums and moves that follows the same rule."""
+    + 1)`, and the numbers themselves if they are constants. Behind the inputs stands whether a
+    number may be other than zero: for sums and moves that follows the same rule."""
 
     depends: np.ndarray
     known: np.ndarray | None = None
@@ -32,35 +35,14 @@ class Value(NamedTuple):
 # Larger constants are not folded: their zeros are not worth the time.
 _MOST_FOLDED = 1_000_000
 
-_FOLDED_WITH_NUMPY = {
-    "add": np.add,
-    "and": np.bitwise_and,
-    "eq": np.equal,
-    "ge": np.greater_equal,
-    "gt": np.greater,
-    "le": np.less_equal,
-    "lt": np.less,
-    "mul": np.multiply,
-    "ne": np.not_equal,
-    "neg": np.negative,
-    "sub": np.subtract,
-}
-
 
 def known_value(equation: Any, values: list[Value]) -> list[np.ndarray] | None:
     """What an equation makes of constants, if it is known."""
-    operands = [value.known for value in values if value.known is not None]
-    if len(operands) < len(values):
+    size = sum(math.prod(out.aval.shape) for out in equation.outvars)
+    if size > _MOST_FOLDED or any(value.known is None for value in values):
         return None
-    if sum(int(np.prod(out.aval.shape)) for out in equation.outvars) > _MOST_FOLDED:
-        return None
-    name = equation.primitive.name
     try:
-        if name in _FOLDED_WITH_NUMPY:
-            return [np.asarray(_FOLDED_WITH_NUMPY[name](*operands))]
-        if name in MOVES and name != "gather":
-            return move(equation, operands)
-        return bind(equation, operands, equation.params)
+        return evaluated(equation.primitive, equation.params, [value.known for value in values])
     except Exception:  # a constant that cannot be evaluated is not known, no more
         return None
 
@@ -122,21 +104,14 @@ def _select(equation: Any, values: list[Value]) -> list[Value]:
 
 
 def _moved(equation: Any, values: list[Value]) -> list[Value] | None:
-    """The primitive is asked where each number goes, with their indices for numbers."""
-    number = num_moved(equation.primitive.name, len(values))
-    operands = [value.known for value in values]
-    if any(operand is None for operand in operands[number:]):
+    found = sources(equation, lambda i: values[i].known)
+    if found is None:
         return None
-    start, rows = 0, []
-    for i, value in enumerate(values[:number]):
-        shape = value.depends.shape[:-1]
-        size = int(np.prod(shape))
-        operands[i] = np.arange(start, start + size, dtype=np.int32).reshape(shape)
-        rows.append(value.depends.reshape(size, value.depends.shape[-1]))
-        start += size
+    which, places = found
+    rows = [values[i].depends.reshape(-1, values[i].depends.shape[-1]) for i in which]
     nowhere = np.arange(rows[0].shape[1]) == rows[0].shape[1] - 1  # some constant
     table = np.concatenate([*rows, nowhere[None]])
-    return [Value(table[places]) for places in move(equation, operands)]  # pyright: ignore[reportArgumentType]
+    return [Value(table[place]) for place in places]
 
 
 def _reduced(equation: Any, values: list[Value]) -> list[Value]:
@@ -152,26 +127,33 @@ def _cumulated(equation: Any, values: list[Value]) -> list[Value]:
 
 def _contracted(equation: Any, values: list[Value]) -> list[Value]:
     """A product of arrays, in which some numbers may be zero."""
-    (left, right), (left_batch, right_batch) = equation.params["dimension_numbers"]
-    letters: list[list[int | None]] = [[None] * (value.depends.ndim - 1) for value in values]
-    axes = iter(range(100))
-    for pairs in (zip(left_batch, right_batch, strict=True), zip(left, right, strict=True)):
-        for i, j in pairs:
-            letters[0][i] = letters[1][j] = next(axes)
-    batch = [letters[0][i] for i in left_batch]
-    free = []
-    for names in letters:
-        for i, name in enumerate(names):
-            if name is None:
-                names[i] = next(axes)
-                free.append(names[i])
-    inputs = next(axes)
-    depends = False
-    for k, value in enumerate(values):
-        there = values[1 - k].depends[..., -1].astype(np.float32)
-        own = value.depends.astype(np.float32), [*letters[k], inputs]
-        depends |= np.einsum(*own, there, letters[1 - k], [*batch, *free, inputs]) > 0  # pyright: ignore[reportArgumentType, reportCallIssue]
-    return [Value(np.asarray(depends))]
+    arrays = [value.depends.astype(np.float32) for value in values]
+    a, b = arranged_factors(equation, arrays)
+    depends = np.einsum("bisn,bjs->bijn", a, b[..., -1]) + np.einsum(
+        "bis,bjsn->bijn", a[..., -1], b
+    )
+    return [Value((depends > 0).reshape(*equation.outvars[0].aval.shape, -1))]
+
+
+def _landing(equation: Any, operand: tuple, indices: np.ndarray, update: tuple) -> np.ndarray:
+    """Where each number of the update of a scatter goes: its index in the flat operand, -1 if it is
+    dropped. Shapes of operand and update."""
+    keep = ("indices_are_sorted", "unique_indices", "mode")
+    settings = {name: equation.params[name] for name in keep}
+
+    def scattered(u: Any) -> Any:
+        return lax.scatter_add(
+            jnp.zeros(operand, u.dtype),
+            jnp.asarray(indices),
+            u,
+            equation.params["dimension_numbers"],
+            **settings,
+        )
+
+    with jax.ensure_compile_time_eval():
+        places = jnp.asarray(1.0 + np.arange(math.prod(operand)).reshape(operand))
+        (found,) = jax.linear_transpose(scattered, jnp.zeros(update, places.dtype))(places)
+    return np.asarray(np.rint(np.asarray(found)) - 1, int).reshape(update)
 
 
 def _scattered(equation: Any, values: list[Value]) -> list[Value] | None:
@@ -179,7 +161,7 @@ def _scattered(equation: Any, values: list[Value]) -> list[Value] | None:
     if indices.known is None:
         return None
     shape, number = operand.depends.shape[:-1], operand.depends.shape[-1]
-    places = landing(equation, shape, indices.known, update.depends.shape[:-1]).ravel()
+    places = _landing(equation, shape, indices.known, update.depends.shape[:-1]).ravel()
     lands = places >= 0
     result = operand.depends.reshape(-1, number).copy()
     if equation.primitive.name == "scatter":  # what was there is replaced
@@ -188,15 +170,6 @@ def _scattered(equation: Any, values: list[Value]) -> list[Value] | None:
     return [Value(result.reshape(*shape, number))]
 
 
-_VANISHING = """
-    abs add add_any asin asinh atan atanh cbrt ceil convert_element_type copy erf expm1 floor imag
-    log1p max min neg real reduce_precision round sign sin sinh sqrt square stop_gradient sub tan tanh
-"""
-_ELEMENTWISE = """
-    acos acosh and atan2 bessel_i0e bessel_i1e clamp complex conj cos cosh digamma eq erf_inv erfc exp
-    exp2 ge gt igamma igamma_grad_a igammac is_finite le lgamma log logistic lt ne nextafter not or
-    polygamma pow regularized_incomplete_beta rem rsqrt xor zeta
-"""
 _REDUCTIONS = "reduce_and reduce_max reduce_min reduce_or reduce_prod reduce_sum reduce_xor"
 _CUMULATIONS = "cumlogsumexp cummax cummin cumprod cumsum"
 _SCATTERS = """
@@ -205,8 +178,8 @@ _SCATTERS = """
 """
 
 RULES: dict[str, Callable[[Any, list[Value]], list[Value] | None]] = {
-    **dict.fromkeys(_VANISHING.split(), _vanishing),
-    **dict.fromkeys(_ELEMENTWISE.split(), _elementwise),
+    **dict.fromkeys(VANISHING, _vanishing),
+    **dict.fromkeys(ELEMENTWISE, _elementwise),
     **dict.fromkeys(MOVES, _moved),
     **dict.fromkeys(_REDUCTIONS.split(), _reduced),
     **dict.fromkeys(_CUMULATIONS.split(), _cumulated),

@@ -4,31 +4,27 @@ Zeros that are known are taken to be exact: `0 x = 0` also where `x` is not fini
 of the structure, as in Jacobians and tableaus.
 """
 
+from collections.abc import Callable
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from . import primitives
 from .lane_arrays import Lanes
 from .lane_value import Number, object_array, Value
+from .primitives import evaluated, unsharded
 
 
-ELEMENTWISE = frozenset(
-    "abs acos acosh add add_any and asin asinh atan atan2 atanh cbrt ceil clamp convert_element_type "
-    "copy copy_p cos cosh digamma div eq erf erf_inv erfc exp exp2 expm1 floor ge gt integer_pow "
-    "is_finite le lgamma log log1p logistic lt max min mul ne neg nextafter not or pow rem round rsqrt "
-    "select_n sign sin sinh sqrt square stop_gradient sub tan tanh xor".split()
+ELEMENTWISE = frozenset({*primitives.VANISHING, *primitives.ELEMENTWISE}).union(
+    ("copy_p", "div", "integer_pow", "mul", "select_n")
 )
 
 
 def elementwise(lanes: Lanes, equation: Any, values: list[Value]) -> list[Value]:
     aval = equation.outvars[0].aval
     operands = [np.broadcast_to(v.numbers(), aval.shape) for v in values]
-    params = {k: v for k, v in equation.params.items() if k != "sharding"}
-    if "sharding" in equation.params:
-        params["sharding"] = None
+    params = unsharded(equation.params)
     out = [
         apply(lanes, equation.primitive, params, aval.dtype, [x[index] for x in operands])
         for index in np.ndindex(*aval.shape)
@@ -40,37 +36,10 @@ def apply(
     lanes: Lanes, primitive: Any, params: dict[str, Any], dtype: Any, numbers: list[Number]
 ) -> Number:
     if all(isinstance(x, np.generic) for x in numbers):
-        return _of_constants(primitive, params, numbers)
+        return evaluated(primitive, params, numbers)[0][()]
     rule = _SHORTER.get(primitive.name)
     shorter = None if rule is None else rule(lanes, params, *numbers)
     return lanes.apply(primitive, params, dtype, *numbers) if shorter is None else shorter
-
-
-def add(lanes: Lanes, a: Number, b: Number) -> Number:
-    return apply(lanes, lax.add_p, {}, a.dtype, [a, b])
-
-
-def multiply(lanes: Lanes, a: Number, b: Number) -> Number:
-    return apply(lanes, lax.mul_p, {}, a.dtype, [a, b])
-
-
-def _of_constants(primitive: Any, params: dict[str, Any], numbers: list[np.generic]) -> np.generic:
-    plain = _PLAIN.get(primitive.name)
-    if plain is not None and np.issubdtype(numbers[0].dtype, np.floating):
-        with np.errstate(all="ignore"):
-            return numbers[0].dtype.type(plain(*numbers))
-    with jax.ensure_compile_time_eval():
-        return np.asarray(primitive.bind(*map(jnp.asarray, numbers), **params))[()]  # pyright: ignore[reportReturnType]
-
-
-_PLAIN = {
-    "add": np.add,
-    "add_any": np.add,
-    "sub": np.subtract,
-    "mul": np.multiply,
-    "neg": np.negative,
-    "div": np.divide,
-}
 
 
 def _is(x: Number, value: int) -> bool:
@@ -98,36 +67,22 @@ def _mul(lanes: Lanes, params: Any, a: Number, b: Number) -> Number | None:
     return None
 
 
-def _div(lanes: Lanes, params: Any, a: Number, b: Number) -> Number | None:
-    return a if _is(b, 1) else None
+def _logical(neutral: bool) -> Callable:
+    """`and` (`or`), in which `True` (`False`) changes nothing."""
 
+    def rule(lanes: Lanes, params: Any, a: Number, b: Number) -> Number | None:
+        for x, y in ((a, b), (b, a)):
+            if isinstance(x, np.bool_):
+                return y if x == neutral else x
+        return None
 
-def _and(lanes: Lanes, params: Any, a: Number, b: Number) -> Number | None:
-    for x, y in ((a, b), (b, a)):
-        if isinstance(x, np.bool_):
-            return y if x else x
-    return None
-
-
-def _or(lanes: Lanes, params: Any, a: Number, b: Number) -> Number | None:
-    for x, y in ((a, b), (b, a)):
-        if isinstance(x, np.bool_):
-            return x if x else y
-    return None
+    return rule
 
 
 def _select(lanes: Lanes, params: Any, which: Number, *cases: Number) -> Number | None:
     if isinstance(which, np.generic):
         return cases[int(which)]
     return cases[0] if all(case is cases[0] for case in cases) else None
-
-
-def _same(lanes: Lanes, params: Any, x: Number) -> Number:
-    return x
-
-
-def _converted(lanes: Lanes, params: Any, x: Number) -> Number | None:
-    return x if x.dtype == params["new_dtype"] else None
 
 
 def _power(lanes: Lanes, params: Any, x: Number) -> Number | None:
@@ -141,13 +96,11 @@ _SHORTER = {
     "add_any": _add,
     "sub": _sub,
     "mul": _mul,
-    "div": _div,
-    "and": _and,
-    "or": _or,
+    "div": lambda lanes, params, a, b: a if _is(b, 1) else None,
+    "and": _logical(True),
+    "or": _logical(False),
     "select_n": _select,
-    "copy": _same,
-    "copy_p": _same,
-    "stop_gradient": _same,
-    "convert_element_type": _converted,
+    "convert_element_type": lambda lanes, params, x: x if x.dtype == params["new_dtype"] else None,
     "integer_pow": _power,
+    **dict.fromkeys(("copy", "copy_p", "stop_gradient"), lambda lanes, params, x: x),
 }

@@ -103,14 +103,13 @@ class Lanes:
         array = node.primitive.bind(*arrays, **node.params)
         operands = sum(y.copied for y in node.operands if isinstance(y, Node))
         node.copied = _LONG.get(node.primitive.name, 1) + operands
+        one = self._one
+        settles = one is not None and array.ndim == 1 and array.dtype == one.dtype
         if node.primitive.name in _COMPUTED_ONCE:
             node.copied = 0
-        elif node.copied * (node.uses - 1) > _DIVISION and self._can_settle(array):
-            array, node.copied = array / self._one, 0
+        elif settles and node.copied * (node.uses - 1) > _DIVISION:
+            array, node.copied = array / one, 0
         node.array = array
-
-    def _can_settle(self, array: jax.Array) -> bool:
-        return self._one is not None and array.ndim == 1 and array.dtype == self._one.dtype
 
     def _key(self, primitive: Any, params: dict[str, Any], numbers: tuple[Number, ...]) -> Any:
         same = [(x.dtype.str, x.tobytes()) if isinstance(x, np.generic) else id(x) for x in numbers]

@@ -1,38 +1,26 @@
 """The interpreter: a traced function, evaluated with numbers instead of arrays."""
 
+import functools
 from collections.abc import Callable
 from typing import Any
 
 import jax
-import jax.extend.core as jax_core
+import jax.numpy as jnp
 import jax.tree_util as jtu
-import numpy as np
+from jax import lax
 
-from . import lane_control as control, lane_structure as structure
-from .lane_arithmetic import ELEMENTWISE, elementwise
+from . import lane_structure as structure
+from .lane_arithmetic import apply, ELEMENTWISE, elementwise
 from .lane_arrays import Lanes, NotScalarError
-from .lane_value import Value
-from .trace import example
+from .lane_value import Columns, object_array, Value, where
+from .primitives import MOVES
+from .trace import called, example, unrolled_scan, walk
 
 
-_CALLS = frozenset(
-    "jit pjit closed_call core_call custom_jvp_call custom_vjp_call custom_vjp_call_jaxpr remat2 "
-    "checkpoint call_with_derivative_rule".split()
-)
-_CONTROL = {
-    "cond": control.cond,
-    "custom_linear_solve": control.linear_solve,
-    "linear_solve": control.linear_solve,
-    "scan": control.scan,
-    "while": control.while_loop,
-}
-_OTHERS = {
-    "dot_general": structure.dot_general,
-    "iota": structure.iota,
-    "platform_index": structure.platform,
-}
 # Numbers of an array beyond which it stays one.
 _LARGEST_ARRAY = 1000
+# Repetitions that are written out.
+_LONGEST_WRITTEN_OUT = 16
 
 
 def call_in_lanes(lanes: Lanes, function: Callable, *args: Any) -> Any:
@@ -47,50 +35,22 @@ def call_in_lanes(lanes: Lanes, function: Callable, *args: Any) -> Any:
 
 def evaluate(lanes: Lanes, function: Any, values: list[Value]) -> list[Value]:
     """A jaxpr, with or without its constants."""
-    jaxpr, constants = getattr(function, "jaxpr", function), getattr(function, "consts", [])
-    known: dict[Any, Value] = {}
-
-    def read(v: Any) -> Value:
-        if isinstance(v, jax_core.Literal):
-            return Value.of_constant(np.asarray(v.val, v.aval.dtype))  # pyright: ignore[reportAttributeAccessIssue]
-        return known[v]
-
-    for v, c in zip(jaxpr.constvars, constants, strict=True):
-        known[v] = Value.of_constant(c)
-    for v, x in zip(jaxpr.invars, values, strict=True):
-        known[v] = x
-    for equation in jaxpr.eqns:
-        out = _evaluated(lanes, equation, [read(v) for v in equation.invars])
-        known.update(zip(equation.outvars, out, strict=True))
-    return [read(v) for v in jaxpr.outvars]
+    return walk(function, values, Value.of_constant, functools.partial(_evaluated, lanes))
 
 
 def _evaluated(lanes: Lanes, equation: Any, values: list[Value]) -> list[Value]:
     name = equation.primitive.name
     if any(jax.dtypes.issubdtype(v.aval.dtype, jax.dtypes.extended) for v in equation.outvars):  # pyright: ignore[reportPrivateImportUsage]
         raise NotScalarError(f"`{name}` makes random keys")
-    if name in _CALLS:
-        return control.call(evaluate, lanes, equation, values)
-    out = None
     if name in _CONTROL:
-        out = _CONTROL[name](evaluate, lanes, equation, values)
-    elif (
-        max((v.aval.size for v in (*equation.outvars, *equation.invars)), default=0)
-        <= _LARGEST_ARRAY
-    ):
-        rule = _rule(name)
+        out = _CONTROL[name](lanes, equation, values)
+    elif (inner := called(equation)) is not None:
+        return evaluate(lanes, inner, values)
+    else:
+        sizes = (v.aval.size for v in (*equation.outvars, *equation.invars))
+        rule = _RULES.get(name) if max(sizes, default=0) <= _LARGEST_ARRAY else None
         out = None if rule is None else rule(lanes, equation, values)
     return _on_whole_arrays(lanes, equation, values) if out is None else out
-
-
-def _rule(name: str) -> Callable | None:
-    if name in ELEMENTWISE:
-        return elementwise
-    if name in structure.MOVES:
-        return structure.move
-    if name in structure.REDUCTIONS:
-        return structure.reduce
-    return _OTHERS.get(name)
 
 
 def _on_whole_arrays(lanes: Lanes, equation: Any, values: list[Value]) -> list[Value]:
@@ -106,3 +66,91 @@ def _on_whole_arrays(lanes: Lanes, equation: Any, values: list[Value]) -> list[V
         return [Value.of_constant(x) for x in bind()]
     out = jax.vmap(bind, in_axes=-1, out_axes=-1)(*(v.whole(lanes) for v in values))
     return [Value.of_whole(x) for x in out]
+
+
+def _linear_solve(lanes: Lanes, equation: Any, values: list[Value]) -> list[Value]:
+    lengths, jaxprs = equation.params["const_lengths"], equation.params["jaxprs"]
+    before = lengths.matvec + lengths.vecmat
+    constants = values[before : before + lengths.solve]
+    return evaluate(lanes, jaxprs.solve, constants + values[sum(lengths) :])
+
+
+def _cond(lanes: Lanes, equation: Any, values: list[Value]) -> list[Value]:
+    """All branches, unless it is known which is taken."""
+    which, *operands = values
+    branches = equation.params["branches"]
+    if which.is_known:
+        return evaluate(lanes, branches[int(which.known())], operands)
+    number = which.numbers()[()]
+    outs = [evaluate(lanes, branch, operands) for branch in branches]
+    chosen = []
+    for value, *cases in zip(*outs, strict=True):
+        for k, case in enumerate(cases, 1):
+            here = apply(lanes, lax.ge_p, {}, bool, [number, number.dtype.type(k)])
+            value = _selected(lanes, here, case, value)
+        chosen.append(value)
+    return chosen
+
+
+def _selected(lanes: Lanes, here: Any, a: Value, b: Value) -> Value:
+    pairs = zip(a.numbers().ravel(), b.numbers().ravel(), strict=True)
+    out = [apply(lanes, lax.select_n_p, {}, a.dtype, [here, y, x]) for x, y in pairs]
+    return Value.of_numbers(object_array(out, a.shape), a.dtype)
+
+
+def _scan(lanes: Lanes, equation: Any, values: list[Value]) -> list[Value] | None:
+    if equation.params["length"] > _LONGEST_WRITTEN_OUT:
+        return None
+
+    def item(x: Value, i: int) -> Value:
+        return Value.of_numbers(
+            object_array(list(x.numbers()[i : i + 1].flat), x.shape[1:]), x.dtype
+        )
+
+    def stack(rows: list[Value], aval: Any) -> Value:
+        numbers = [x for row in rows for x in row.numbers().flat]
+        return Value.of_numbers(object_array(numbers, aval.shape), aval.dtype)
+
+    through = functools.partial(evaluate, lanes)
+    return unrolled_scan(equation, values, through, item, stack)
+
+
+def _while_loop(lanes: Lanes, equation: Any, values: list[Value]) -> list[Value]:
+    """Evaluate a loop for as long as any lane goes on; the others keep what they have."""
+    params = equation.params
+    m, n = params["cond_nconsts"], params["body_nconsts"]
+    entering = lambda values: [value.entering(lanes) for value in values]
+    cond_consts, body_consts = entering(values[:m]), entering(values[m : m + n])
+    columns = Columns.of_values(values[m + n :], lanes)
+
+    def goes_on(columns: Columns) -> jax.Array:
+        values = [*entering(cond_consts), *columns.values()]
+        return evaluate(lanes, params["cond_jaxpr"], values)[0].columns(lanes)[0]
+
+    def body(carry: tuple[jax.Array, Columns]) -> tuple[jax.Array, Columns]:
+        active, columns = carry
+        with lanes.inside():
+            values = [*entering(body_consts), *columns.values()]
+            new = Columns.of_values(evaluate(lanes, params["body_jaxpr"], values), lanes)
+            columns = where(active, new, columns)
+            return active & goes_on(columns), columns
+
+    start = goes_on(columns), columns
+    return lax.while_loop(lambda carry: jnp.any(carry[0]), body, start)[1].values()
+
+
+_RULES: dict[str, Callable] = {
+    **dict.fromkeys(MOVES, structure.move),
+    **dict.fromkeys(structure.REDUCTIONS, structure.reduce),
+    **dict.fromkeys(ELEMENTWISE, elementwise),
+    "dot_general": structure.dot_general,
+    "iota": structure.iota,
+    "platform_index": structure.platform,
+}
+_CONTROL = {
+    "cond": _cond,
+    "custom_linear_solve": _linear_solve,
+    "linear_solve": _linear_solve,
+    "scan": _scan,
+    "while": _while_loop,
+}

@@ -1,78 +1,35 @@
 """Operations that move numbers, and sums of them."""
 
 import functools
+import math
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from .lane_arithmetic import add, apply, multiply
+from .lane_arithmetic import apply
 from .lane_arrays import Lanes, NotScalarError
 from .lane_value import object_array, Value
-
-
-# With the number of operands, from the front, that are moved; what follows says where to.
-_MOVED = {
-    "broadcast_in_dim": 1,
-    "concatenate": None,
-    "dynamic_slice": 1,
-    "dynamic_update_slice": 2,
-    "expand_dims": 1,
-    "gather": 1,
-    "pad": 2,
-    "reshape": 1,
-    "rev": 1,
-    "scatter": (0, 2),
-    "slice": 1,
-    "split": 1,
-    "squeeze": 1,
-    "stack": None,
-    "tile": 1,
-    "transpose": 1,
-    "unstack": 1,
-}
-MOVES = frozenset(_MOVED)
+from .primitives import arranged_factors, evaluated, sources
 
 
 def move(lanes: Lanes, equation: Any, values: list[Value]) -> list[Value] | None:
-    """The primitive itself is asked where each number goes, with their indices for numbers. `None`
-    if that depends on numbers that are not constants."""
-    which = _MOVED[equation.primitive.name]
-    if which is None or isinstance(which, int):
-        which = tuple(range(len(values) if which is None else which))
-    if not all(v.is_known for i, v in enumerate(values) if i not in which):
+    """`None` if it depends on numbers that are not constants where they go, or if others come in."""
+    known = lambda i: values[i].known() if values[i].is_known else None
+    found = sources(equation, known)
+    if found is None or any((place < 0).any() for place in found[1]):
         return None
-    numbers = [values[i].numbers().ravel() for i in which]
-    offsets = np.cumsum([0, *(x.size for x in numbers)])
-    operands = [None if i in which else v.known() for i, v in enumerate(values)]
-    for offset, i in zip(offsets, which, strict=False):
-        shape = values[i].shape
-        # From one on: what is filled in from nowhere is zero or negative.
-        indices = offset + 1 + np.arange(int(np.prod(shape)), dtype=np.int32)
-        operands[i] = indices.reshape(shape).astype(np.int32)
-    moved = _bind(equation, operands)
-    if any((x <= 0).any() for x in moved):
-        return None
-    flat = np.concatenate(numbers)
+    which, places = found
+    numbers = np.concatenate([values[i].numbers().ravel() for i in which])
     return [
-        Value.of_numbers(object_array([flat[k - 1] for k in x.ravel()], x.shape), out.aval.dtype)
-        for x, out in zip(moved, equation.outvars, strict=True)
+        Value.of_numbers(numbers[place.ravel()].reshape(place.shape), out.aval.dtype)
+        for place, out in zip(places, equation.outvars, strict=True)
     ]
 
 
-def _bind(equation: Any, operands: list[Any]) -> list[np.ndarray]:
-    params = dict(equation.params)
-    if "sharding" in params:
-        params["sharding"] = None
-    with jax.ensure_compile_time_eval():
-        out = equation.primitive.bind(*map(jnp.asarray, operands), **params)
-    return [np.asarray(x) for x in (out if equation.primitive.multiple_results else [out])]
-
-
 def iota(lanes: Lanes, equation: Any, values: list[Value]) -> list[Value]:
-    return [Value.of_constant(x) for x in _bind(equation, [])]
+    return [Value.of_constant(x) for x in evaluated(equation.primitive, equation.params, [])]
 
 
 def platform(lanes: Lanes, equation: Any, values: list[Value]) -> list[Value]:
@@ -88,34 +45,25 @@ _LARGEST_DOT = 2000
 
 
 def dot_general(lanes: Lanes, equation: Any, values: list[Value]) -> list[Value] | None:
-    (a_sum, b_sum), (a_batch, b_batch) = equation.params["dimension_numbers"]
     aval = equation.outvars[0].aval
-    length = int(np.prod([values[0].shape[i] for i in a_sum]))
-    if int(np.prod(aval.shape)) * length > _LARGEST_DOT or values[0].dtype != values[1].dtype:
+    length = math.prod(values[0].shape[i] for i in equation.params["dimension_numbers"][0][0])
+    if math.prod(aval.shape) * length > _LARGEST_DOT or values[0].dtype != values[1].dtype:
         return None
-    A, batch, a_free = _arranged(values[0], a_batch, a_sum)
-    B, _, b_free = _arranged(values[1], b_batch, b_sum)
+    A, B = arranged_factors(equation, [value.numbers() for value in values])
     zero = np.zeros((), aval.dtype)[()]
 
+    def combine(primitive: Any, *numbers: Any) -> Any:
+        return apply(lanes, primitive, {}, aval.dtype, list(numbers))
+
     def entry(k: int, i: int, j: int) -> Any:
-        products = (multiply(lanes, x, y) for x, y in zip(A[k, i], B[k, j], strict=True))
-        return functools.reduce(lambda s, p: add(lanes, s, p), products, zero)
+        products = map(functools.partial(combine, lax.mul_p), A[k, i], B[k, j])
+        return functools.reduce(functools.partial(combine, lax.add_p), products, zero)
 
-    shape = A.shape[0], A.shape[1], B.shape[1]
-    out = object_array([entry(*index) for index in np.ndindex(*shape)], shape)
-    return [Value.of_numbers(out.reshape((*batch, *a_free, *b_free)), aval.dtype)]
-
-
-def _arranged(value: Value, batch: Any, summed: Any) -> tuple[np.ndarray, list[int], list[int]]:
-    """Arrange a value with axes `(batch, free, summed)`."""
-    x = value.numbers()
-    free = [i for i in range(x.ndim) if i not in (*batch, *summed)]
-    sizes = [[x.shape[i] for i in axes] for axes in (batch, free, summed)]
-    x = np.transpose(x, (*batch, *free, *summed))
-    return x.reshape([int(np.prod(size)) for size in sizes]), sizes[0], sizes[1]
+    indices = np.ndindex(A.shape[0], A.shape[1], B.shape[1])
+    return [Value.of_numbers(object_array([entry(*i) for i in indices], aval.shape), aval.dtype)]
 
 
-_REDUCTIONS = {
+REDUCTIONS = {
     "reduce_sum": lax.add_p,
     "reduce_prod": lax.mul_p,
     "reduce_max": lax.max_p,
@@ -123,11 +71,10 @@ _REDUCTIONS = {
     "reduce_and": lax.and_p,
     "reduce_or": lax.or_p,
 }
-REDUCTIONS = frozenset(_REDUCTIONS)
 
 
 def reduce(lanes: Lanes, equation: Any, values: list[Value]) -> list[Value] | None:
-    primitive, aval = _REDUCTIONS[equation.primitive.name], equation.outvars[0].aval
+    primitive, aval = REDUCTIONS[equation.primitive.name], equation.outvars[0].aval
     if primitive in (lax.and_p, lax.or_p) and aval.dtype != bool:
         return None
     x, axes = values[0].numbers(), equation.params["axes"]

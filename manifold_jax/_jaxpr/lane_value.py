@@ -1,12 +1,17 @@
 """An array that every lane has one of, as separate numbers or as a whole."""
 
+import math
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.core
 import jax.numpy as jnp
+import jax.tree_util as jtu
 import numpy as np
+
+from .trace import example
 
 
 class Node:
@@ -31,8 +36,8 @@ Number = Any
 
 class Value:
     """An array of shape `shape` in each lane. `numbers()` is an object array of that shape of
-    [`Number`][]s;
-    `whole(lanes)` an array of shape `(*shape, count)`: the lanes are contiguous in memory.
+    [`Number`][]s; `whole(lanes)` an array of shape `(*shape, count)`: the lanes are contiguous in
+    memory.
 
     Whichever is not there is made when it is asked for.
     """
@@ -48,10 +53,13 @@ class Value:
     @staticmethod
     def of_constant(x: Any) -> "Value":
         """The same in every lane: an array, also one that is being traced."""
-        if isinstance(x, jax.core.Tracer | jax.Array) and not _is_known(x):
-            return Value(x.shape, x.dtype, lambda: _split(x, x.shape))
-        x = np.asarray(x)
-        return Value(x.shape, x.dtype, lambda: _known_numbers(x))
+        x = x if isinstance(x, jax.core.Tracer) else np.asarray(x)
+        return Value(x.shape, x.dtype, lambda: _split(x, x.shape))
+
+    @staticmethod
+    def of_column(x: jax.Array) -> "Value":
+        """Make a value from one number of each lane."""
+        return Value.of_numbers(object_array([x], ()), x.dtype)
 
     @staticmethod
     def of_whole(x: jax.Array) -> "Value":
@@ -91,7 +99,7 @@ class Value:
         return all(isinstance(x, np.generic) for x in self.numbers().flat)
 
     def known(self) -> np.ndarray:
-        return np.array([x for x in self.numbers().flat], self.dtype).reshape(self.shape)
+        return np.array(list(self.numbers().flat), self.dtype).reshape(self.shape)
 
 
 def object_array(items: list[Any], shape: tuple[int, ...]) -> np.ndarray:
@@ -102,13 +110,80 @@ def object_array(items: list[Any], shape: tuple[int, ...]) -> np.ndarray:
     return out.reshape(shape)
 
 
-def _split(x: jax.Array, shape: tuple[int, ...]) -> np.ndarray:
+def _split(x: Any, shape: tuple[int, ...]) -> np.ndarray:
     return object_array([x[index] for index in np.ndindex(*shape)], shape)
 
 
-def _known_numbers(x: np.ndarray) -> np.ndarray:
-    return object_array([x[index] for index in np.ndindex(*x.shape)], x.shape)
+class Layout(NamedTuple):
+    """How columns, one number of each lane or each trajectory, make up a tree."""
+
+    treedef: Any
+    shapes: tuple[tuple[int, ...], ...]
+    dtypes: tuple[np.dtype, ...]
+
+    @staticmethod
+    def of(tree: Any) -> "Layout":
+        """Return the layout of a tree of [`Value`][]s, or of arrays of one trajectory."""
+        leaves, treedef = jtu.tree_flatten(tree)
+        dtypes = (np.dtype(x.dtype) for x in leaves)
+        return Layout(treedef, tuple(x.shape for x in leaves), tuple(dtypes))
+
+    @staticmethod
+    def of_one(tree: Any) -> "Layout":
+        """Return the layout of one of the trajectories that arrays have in front."""
+        return Layout.of(jtu.tree_map(lambda x: example(x.shape[1:], x.dtype), tree))
+
+    def dtypes_of_columns(self) -> list[np.dtype]:
+        each = zip(self.shapes, self.dtypes, strict=True)
+        return [dtype for shape, dtype in each for _ in range(math.prod(shape))]
+
+    def example(self) -> Any:
+        """Return an example to trace functions of one trajectory with."""
+        return jtu.tree_unflatten(self.treedef, list(map(example, self.shapes, self.dtypes)))
 
 
-def _is_known(x: Any) -> bool:
-    return isinstance(x, jax.Array) and not isinstance(x, jax.core.Tracer)
+class Columns(eqx.Module):
+    """A tree as a list of columns."""
+
+    columns: list[jax.Array]
+    layout: Layout = eqx.field(static=True)
+
+    @staticmethod
+    def zeros(layout: Layout, count: int) -> "Columns":
+        return Columns([jnp.zeros(count, dtype) for dtype in layout.dtypes_of_columns()], layout)
+
+    @staticmethod
+    def of_values(tree: Any, lanes: Any) -> "Columns":
+        columns = [column for value in jtu.tree_leaves(tree) for column in value.columns(lanes)]
+        return Columns(columns, Layout.of(tree))
+
+    @staticmethod
+    def of_arrays(tree: Any) -> "Columns":
+        """Return the columns of arrays with the trajectories in front."""
+        flat = lambda leaf: leaf.reshape(leaf.shape[0], math.prod(leaf.shape[1:]))
+        columns = [column for leaf in jtu.tree_leaves(tree) for column in flat(leaf).T]
+        return Columns(columns, Layout.of_one(tree))
+
+    def values(self) -> Any:
+        out, k = [], 0
+        for shape, dtype in zip(self.layout.shapes, self.layout.dtypes, strict=True):
+            numbers = object_array(self.columns[k : k + math.prod(shape)], shape)
+            out.append(Value.of_numbers(numbers, dtype))
+            k += numbers.size
+        return jtu.tree_unflatten(self.layout.treedef, out)
+
+    def arrays(self) -> Any:
+        """Return arrays with the trajectories in front."""
+        rows = self.columns[0].shape[0] if self.columns else 0
+
+        def array(value: Value) -> jax.Array:
+            numbers = list(value.numbers().flat)
+            found = jnp.stack(numbers, axis=1) if numbers else jnp.zeros(0, value.dtype)
+            return found.reshape(rows, *value.shape)
+
+        return jtu.tree_map(array, self.values())
+
+
+def where(chosen: jax.Array, a: Any, b: Any) -> Any:
+    """Return the columns of trees `a` or `b`, lane by lane."""
+    return jtu.tree_map(lambda x, y: jax.lax.select(chosen, x, y), a, b)

@@ -1,17 +1,65 @@
-"""What functions are traced with, and how long a traced function is."""
+"""Traced functions: walked through with values of any kind in the place of arrays, and their length."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
 import jax.extend.core as jax_core
+import numpy as np
 from jax.sharding import NamedSharding, PartitionSpec
+
+from .._base.compat import scan_counts
+
+
+def walk(function: Any, inputs: Sequence[Any], constant: Callable, apply: Callable) -> list[Any]:
+    """Return what a jaxpr, with or without its constants, makes of the values `inputs`, in the
+    order of execution. `constant(x)` is the value of a constant; `apply(equation, values)` are those
+    of the results of an equation."""
+    jaxpr, constants = getattr(function, "jaxpr", function), getattr(function, "consts", ())
+    known = dict(zip(jaxpr.constvars, map(constant, constants), strict=True))
+    known.update(zip(jaxpr.invars, inputs, strict=True))
+
+    def read(v: Any) -> Any:
+        is_literal = isinstance(v, jax_core.Literal)
+        return constant(np.asarray(v.val, v.aval.dtype)) if is_literal else known[v]  # pyright: ignore[reportAttributeAccessIssue]
+
+    for equation in jaxpr.eqns:
+        out = apply(equation, [read(v) for v in equation.invars])
+        known.update(zip(equation.outvars, out, strict=True))
+    return [read(v) for v in jaxpr.outvars]
+
+
+def called(equation: Any) -> Any:
+    """The function that an equation applies to exactly its operands, if that is what it does."""
+    shapes = lambda variables: [variable.aval.shape for variable in variables]
+    kinds = jax_core.Jaxpr | jax_core.ClosedJaxpr
+    inner = [p for p in equation.params.values() if isinstance(p, kinds)]
+    if len(inner) != 1:
+        return None
+    jaxpr = getattr(inner[0], "jaxpr", inner[0])
+    same = shapes(jaxpr.invars) == shapes(equation.invars)
+    return inner[0] if same and shapes(jaxpr.outvars) == shapes(equation.outvars) else None
+
+
+def unrolled_scan(
+    equation: Any, values: list[Any], through: Callable, item: Callable, stack: Callable
+) -> list[Any]:
+    """A scan, iteration by iteration. `through(function, values)` are the values that the body
+    returns, `item(value, i)` is one row, and `stack(values, aval)` puts rows together."""
+    (n, m), params = scan_counts(equation), equation.params
+    constants, carry, xs = values[:n], values[n : n + m], values[n + m :]
+    rows: list[list[Any]] = [[]] * params["length"]
+    for i in range(params["length"])[:: -1 if params["reverse"] else 1]:
+        after = through(params["jaxpr"], [*constants, *carry, *(item(x, i) for x in xs)])
+        carry, rows[i] = after[:m], after[m:]
+    outs = enumerate(equation.outvars[m:])
+    return [*carry, *(stack([row[k] for row in rows], out.aval) for k, out in outs)]
 
 
 def example(shape: tuple[int, ...], dtype: Any) -> jax.ShapeDtypeStruct:
     """Return the shape and type of an array of one lane. Inside `jax.shard_map` the types of
-    arrays name the mesh, and
-    `eqx.filter_closure_convert` refuses those that do not where it has seen others."""
+    arrays name the mesh, and `eqx.filter_closure_convert` refuses those that do not where it has
+    seen others."""
     mesh = jax.sharding.get_abstract_mesh()
     if mesh.empty:
         return jax.ShapeDtypeStruct(shape, dtype)
@@ -25,9 +73,5 @@ def num_equations(function: Callable[..., Any], *examples: Any) -> int:
 
 
 def _length(jaxpr: Any) -> int:
-    total = 0
-    for equation in jaxpr.eqns:
-        total += 1
-        for inner in jax_core.jaxprs_in_params(equation.params):
-            total += _length(inner)
-    return total
+    inner = (f for e in jaxpr.eqns for f in jax_core.jaxprs_in_params(e.params))
+    return len(jaxpr.eqns) + sum(map(_length, inner))

@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 
+from .._adjoint.events import EVENT_KEYWORDS
 from .._base.compat import save_y
 from .._base.types import Args, RealScalarLike, Y
 from .._base.user_functions import check_function
@@ -23,10 +24,6 @@ from .._solver.terms import DirectedTerm
 
 
 Function = TypeVar("Function", bound=Callable)
-
-# What Diffrax passes to an event function by name.
-_EVENT_KEYWORDS = ("terms", "solver", "t0", "t1", "dt0", "saveat", "stepsize_controller")
-_EVENT_KEYWORDS += ("max_steps",)
 
 
 def check_arguments(
@@ -58,7 +55,7 @@ def check_arguments(
         _check_kind("event", event, dfx.Event, "diffrax.Event(cond_fn)")
         for cond_fn in jtu.tree_leaves(event.cond_fn, is_leaf=callable):
             call = "cond_fn(t, y, args, **kwargs)"
-            check_function("event", cond_fn, call, *_EVENT_KEYWORDS)
+            check_function("event", cond_fn, call, *EVENT_KEYWORDS)
     for sub in jtu.tree_leaves(saveat.subs, is_leaf=lambda x: isinstance(x, dfx.SubSaveAt)):
         if sub.fn is not save_y:
             check_function("saveat.fn", sub.fn, "fn(t, y, args)")

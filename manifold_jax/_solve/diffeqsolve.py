@@ -25,7 +25,7 @@ from .finish import finish
 from .mass_matrix import trusting
 from .output import events_in_true_time, saving
 from .prepare import prepare, time_dtype
-from .setup import Consistent, Given, Setup
+from .setup import Consistent, ProblemData, Setup
 from .times import checking_first_step, refusing_missing_times
 
 
@@ -118,8 +118,8 @@ def diffeqsolve(
         y0 = raise_if_unstable(y0, terms, solver, dt0)
     solver = _as_in_steps(solver, stepsize_controller, event, consistent, y0)
     setup = Setup(terms, solver, dt0, saveat, stepsize_controller, consistent, throw, event)
-    ready = prepare(setup, Given(t0, t1, y0, args))
-    t0, t1, y0, _ = ready.given
+    ready = prepare(setup, ProblemData(t0, t1, y0, args))
+    t0, t1, y0, _ = ready.data
     adjoint = CheckedStartAdjoint(adjoint)
     if event is not None and event.root_finder is not None:
         adjoint = LocatingAdjoint(adjoint)

@@ -33,9 +33,9 @@ def finish(
 
 
 def _corrected(setup: Setup, ready: Ready, sol: dfx.Solution, constraint: Any) -> dfx.Solution:
-    solver, saveat, (_, _, y0, args) = setup.solver, setup.saveat, ready.given
+    solver, saveat, (_, _, y0, args) = setup.solver, setup.saveat, ready.data
     statistics = sol.solver_state.statistics  # pyright: ignore[reportOptionalMemberAccess]
-    ys, failed = project_output(setup, ready.given, sol.ts, sol.ys)
+    ys, failed = project_output(setup, ready.data, sol.ts, sol.ys)
     # Diffrax forgets that a step failed if it has an event, too.
     result = update_result(sol.result, sol.solver_state.result)  # pyright: ignore[reportOptionalMemberAccess]
     result = update_result(result, RESULTS.where(failed, nonlinear_failure(), RESULTS.successful))
@@ -45,7 +45,7 @@ def _corrected(setup: Setup, ready: Ready, sol: dfx.Solution, constraint: Any) -
     interpolation: Any = sol.interpolation
     if interpolation is not None and solver.corrects_output:
         interpolation = ManifoldInterpolation.build(
-            interpolation, constraint, solver.projection, ready.given.t0, y0, args
+            interpolation, constraint, solver.projection, ready.data.t0, y0, args
         )
     stats = {
         **sol.stats,

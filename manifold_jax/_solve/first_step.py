@@ -9,7 +9,7 @@ import jax.tree_util as jtu
 from jaxtyping import Array
 
 from .._base.types import BoolScalar, FloatScalar, Y
-from .setup import Given
+from .setup import ProblemData
 
 
 class FirstStep(NamedTuple):
@@ -20,7 +20,7 @@ class FirstStep(NamedTuple):
 
 
 def first_step(
-    terms: Any, solver: dfx.AbstractSolver, given: Given, controller: dfx.PIDController
+    terms: Any, solver: dfx.AbstractSolver, data: ProblemData, controller: dfx.PIDController
 ) -> FirstStep:
     """First step of an adaptive solve of an ODE.
 
@@ -32,7 +32,7 @@ def first_step(
     Source: after Hairer, Norsett & Wanner, Solving ODEs I, section II.4 (starting step
     size), whose last formula depends on that unit.
     """
-    t0, t1, y0, args = given
+    t0, t1, y0, args = data
     t0, t1 = jnp.asarray(t0), jnp.asarray(t1)
     order = solver.error_order(terms)
     direction = jnp.where(t1 < t0, -1.0, 1.0).astype(t0.dtype)

@@ -10,13 +10,13 @@ from .._base.types import FloatScalar, Y
 from .._constraint.diagnosis import Diagnosis
 from .._rosenbrock import AbstractRosenbrock, MassMatrixTerm
 from .._rosenbrock.algebraic import faults_of_start, INCONSISTENT, is_small
-from .setup import Consistent, Given, Setup
+from .setup import Consistent, ProblemData, Setup
 
 
-def consistent_with_mass(setup: Setup, given: Given) -> tuple[Y, FloatScalar | None]:
+def consistent_with_mass(setup: Setup, data: ProblemData) -> tuple[Y, FloatScalar | None]:
     """The state to start from, and how far it was moved (`None` without a mass matrix). With `throw`
     the error that names the cause is attached to it; otherwise the first step fails for it."""
-    terms, (t0, _, y0, args) = setup.terms, given
+    terms, (t0, _, y0, args) = setup.terms, data
     if not isinstance(terms, MassMatrixTerm) or setup.consistent == "assume":
         return y0, None
     start, info = terms.consistent_state(t0, y0, args, throw=False)

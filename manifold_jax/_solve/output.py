@@ -14,7 +14,7 @@ from .._base.compat import save_y
 from .._base.types import Args, BoolScalar, Y
 from .._solver.base import AbstractManifoldSolver
 from .prepare import Ready
-from .setup import Given, Setup
+from .setup import ProblemData, Setup
 
 
 # Outputs up to which they are corrected one by one, in a program that compiles in two thirds of the
@@ -74,11 +74,11 @@ def events_in_true_time(setup: Setup, ready: Ready) -> dfx.Event | None:
     original terms and times it is consistent again. States at the ends of steps are on the
     manifold.
     """
-    event, given = setup.event, ready.given
+    event, data = setup.event, ready.data
     if event is None:
         return None
-    known = dict(terms=setup.terms, t0=given.t0, t1=given.t1, dt0=ready.dt0)
-    direction = given.direction
+    known = dict(terms=setup.terms, t0=data.t0, t1=data.t1, dt0=ready.dt0)
+    direction = data.direction
 
     def wrap(cond_fn: Callable) -> Callable:
         return lambda t, y, args, **kwargs: cond_fn(t * direction, y, args, **{**kwargs, **known})
@@ -87,7 +87,7 @@ def events_in_true_time(setup: Setup, ready: Ready) -> dfx.Event | None:
     return dfx.Event(cond_fn, event.root_finder, event.direction)
 
 
-def project_output(setup: Setup, given: Given, ts: Any, ys: Any) -> tuple[Any, BoolScalar]:
+def project_output(setup: Setup, data: ProblemData, ts: Any, ys: Any) -> tuple[Any, BoolScalar]:
     """The saved values, corrected; and whether any of them could not be."""
     solver, failed = setup.solver, jnp.asarray(False)
     if not solver.corrects_output:
@@ -101,7 +101,7 @@ def project_output(setup: Setup, given: Given, ts: Any, ys: Any) -> tuple[Any, B
             values, successes = ys
             failed |= jnp.any(jnp.isfinite(ts) & ~successes)
             return values
-        one = lambda t, y: _corrected(solver, t, y, given.y0, given.args)
+        one = lambda t, y: _corrected(solver, t, y, data.y0, data.args)
         if ts.size <= MOST_ONE_BY_ONE:
             out, failures = jax.lax.map(lambda ty: one(*ty), (ts, ys))
         else:

@@ -18,7 +18,7 @@ from .._solver.terms import DirectedTerm
 from .._solver.unconstrained import Unconstrained
 from .first_step import first_step, FirstStep
 from .mass_matrix import consistent_with_mass
-from .setup import Given, Setup
+from .setup import ProblemData, Setup
 from .start import start_state, StartInfo
 
 
@@ -26,38 +26,38 @@ class Ready(NamedTuple):
     """What a loop starts from; all times in one type of number. The state of the solver, where it
     is known without `solver.init`."""
 
-    given: Given
+    data: ProblemData
     dt0: RealScalarLike | None
     solver_state: HookState | None
     start: StartInfo
 
 
-def prepare(setup: Setup, given: Given) -> Ready:
+def prepare(setup: Setup, data: ProblemData) -> Ready:
     """Make the start consistent, and choose the first step if `dt0` is None. A method of Diffrax
     without a hook is left to Diffrax, for comparisons."""
     if not isinstance(setup.solver, AbstractManifoldSolver | AbstractRosenbrock):
-        return Ready(given, setup.dt0, None, StartInfo(jnp.zeros(()), jnp.asarray(True)))
-    dtype = time_dtype(given.t0, given.t1, setup.dt0, setup.saveat)
-    t0, t1 = jnp.asarray(given.t0, dtype), jnp.asarray(given.t1, dtype)
-    y0, start = _start(setup, given._replace(t0=t0, y0=as_state(given.y0, dtype)))
-    given = Given(t0, t1, y0, given.args)
+        return Ready(data, setup.dt0, None, StartInfo(jnp.zeros(()), jnp.asarray(True)))
+    dtype = time_dtype(data.t0, data.t1, setup.dt0, setup.saveat)
+    t0, t1 = jnp.asarray(data.t0, dtype), jnp.asarray(data.t1, dtype)
+    y0, start = _start(setup, data._replace(t0=t0, y0=as_state(data.y0, dtype)))
+    data = ProblemData(t0, t1, y0, data.args)
     dt0, solver_state = setup.dt0, None
-    if dt0 is None and (first := _chosen_first_step(setup, given)):
+    if dt0 is None and (first := _chosen_first_step(setup, data)):
         dt0 = first.size
-        solver_state = _solver_state(setup, given, first)
+        solver_state = _solver_state(setup, data, first)
     if not setup.throw:  # what starts with NaN ends before its first step
         y0 = jtu.tree_map(lambda leaf: jnp.where(start.success, leaf, jnp.nan), y0)
-    return Ready(given._replace(y0=y0), dt0, solver_state, start)
+    return Ready(data._replace(y0=y0), dt0, solver_state, start)
 
 
-def _start(setup: Setup, given: Given) -> tuple[Y, StartInfo]:
-    y0, moved = consistent_with_mass(setup, given)
+def _start(setup: Setup, data: ProblemData) -> tuple[Y, StartInfo]:
+    y0, moved = consistent_with_mass(setup, data)
     constraint = getattr(setup.solver, "constraint", NoConstraint())
     if isinstance(constraint, NoConstraint):
-        start = StartInfo(jnp.zeros_like(given.t0), jnp.asarray(True))
+        start = StartInfo(jnp.zeros_like(data.t0), jnp.asarray(True))
     else:
-        check_constraint(constraint, given.t0, y0, given.args)
-        y0, start = start_state(setup, given._replace(y0=y0))
+        check_constraint(constraint, data.t0, y0, data.args)
+        y0, start = start_state(setup, data._replace(y0=y0))
     if moved is not None:
         start = start._replace(correction=jnp.maximum(moved, start.correction))
     return y0, start
@@ -78,7 +78,7 @@ def as_state(y0: Y, dtype: Any) -> Y:
         return jtu.tree_map(lambda leaf: jnp.asarray(leaf, jnp.result_type(leaf, dtype)), y0)
 
 
-def _chosen_first_step(setup: Setup, given: Given) -> FirstStep | None:
+def _chosen_first_step(setup: Setup, data: ProblemData) -> FirstStep | None:
     terms, tolerances = setup.terms, controller_tolerances(setup.controller)
     inner = getattr(setup.solver, "inner", setup.solver)
     if isinstance(setup.solver, Unconstrained) and not isinstance(inner, AbstractRosenbrock):
@@ -87,12 +87,12 @@ def _chosen_first_step(setup: Setup, given: Given) -> FirstStep | None:
         terms = dfx.ODETerm(terms.derivative)
     if tolerances is None or not isinstance(terms, dfx.ODETerm | DirectedTerm):
         return None
-    return first_step(terms, setup.solver, given, tolerances)
+    return first_step(terms, setup.solver, data, tolerances)
 
 
-def _solver_state(setup: Setup, given: Given, first: FirstStep) -> HookState | None:
+def _solver_state(setup: Setup, data: ProblemData, first: FirstStep) -> HookState | None:
     """What `solver.init` would evaluate the vector field for once more, if it is that of `terms`."""
-    terms, solver, (t0, _, y0, args) = setup.terms, setup.solver, given
+    terms, solver, (t0, _, y0, args) = setup.terms, setup.solver, data
     if not isinstance(solver, AbstractManifoldSolver) or solver.prepare_terms(terms) is not terms:
         return None
     t1 = t0 + first.size

@@ -11,7 +11,7 @@ from .._base.types import Args, FloatScalar, RealScalarLike, Y
 Consistent: TypeAlias = Literal["project", "check", "assume"]
 
 
-class Given(NamedTuple):
+class ProblemData(NamedTuple):
     """What one trajectory is defined by."""
 
     t0: Any  # a real number, as `t1`

@@ -10,7 +10,7 @@ from .._base.types import BoolScalar, FloatScalar, Y
 from .._constraint.diagnosis import Diagnosis, NOT_THERE
 from .._constraint.project import consistent_state
 from .._constraint.violation import constraint_violation
-from .setup import Given, Setup
+from .setup import ProblemData, Setup
 
 
 class StartInfo(NamedTuple):
@@ -20,9 +20,9 @@ class StartInfo(NamedTuple):
     success: BoolScalar
 
 
-def start_state(setup: Setup, given: Given) -> tuple[Y, StartInfo]:
+def start_state(setup: Setup, data: ProblemData) -> tuple[Y, StartInfo]:
     """The state to start from. With `throw` the error that names the cause is attached to it."""
-    (t0, _, y0, args), consistent = given, setup.consistent
+    (t0, _, y0, args), consistent = data, setup.consistent
     constraint, projection = setup.solver.constraint, setup.solver.projection
     if consistent == "assume":
         dtype = jnp.result_type(*jtu.tree_leaves(y0))

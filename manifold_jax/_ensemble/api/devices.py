@@ -50,13 +50,15 @@ def over_devices(
     # Without axes that are explicit, whose sizes would have to divide the number of trajectories.
     mesh = Mesh(mesh.devices, mesh.axis_names)
     share = -(-batch.size // mesh.size)
-    each = jtu.tree_map(lambda x: _lengthened(x, share * mesh.size, mesh), batch.each)
+    missing, each = share * mesh.size - batch.size, batch.each
+    if missing:
+        each = jtu.tree_map(lambda x: _lengthened(x, missing, mesh), each)
     common, static = eqx.partition((equations, batch.common), eqx.is_array)
 
     def solve_share(common: Any, each: Any) -> EnsembleSolution:
         equations, rest = eqx.combine(common, static)
         own = dataclasses.replace(batch, each=each, common=rest, size=share)
-        return solve((equations, own), mesh.axis_names)
+        return solve(Inputs(equations, own), mesh.axis_names)
 
     shared = PartitionSpec(mesh.axis_names)
     solution = jax.shard_map(
@@ -66,20 +68,14 @@ def over_devices(
         out_specs=shared,
         check_vma=False,  # Diffrax's loops mix what differs between devices and what does not
     )(common, each)
-    return jtu.tree_map(lambda x: _shortened(x, batch.size, mesh), solution)
+    shortened = lambda x: _on_all(_on_all(x, mesh)[: batch.size], mesh)
+    return jtu.tree_map(shortened, solution) if missing else solution
 
 
-def _lengthened(x: Array, size: int, mesh: Mesh) -> Array:
+def _lengthened(x: Array, missing: int, mesh: Mesh) -> Array:
     """Lengthen an array by copies of the last trajectory."""
-    missing = size - x.shape[0]
-    if missing == 0:
-        return x
     x = _on_all(x, mesh)
     return _on_all(jnp.concatenate([x, jnp.repeat(x[-1:], missing, axis=0)]), mesh)
-
-
-def _shortened(x: Array, size: int, mesh: Mesh) -> Array:
-    return x if x.shape[0] == size else _on_all(_on_all(x, mesh)[:size], mesh)
 
 
 def _on_all(x: Array, mesh: Mesh) -> Array:

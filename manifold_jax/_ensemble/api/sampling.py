@@ -11,19 +11,9 @@ import jax.tree_util as jtu
 from jaxtyping import Array
 
 
-class Samples(eqx.Module):
-    """Arguments of `solve_ensemble`, for some of the trajectories."""
-
-    t0: Any
-    t1: Any
-    y0s: Any
-    args: Any
-    args_axes: Any = eqx.field(static=True)
-
-
-def drawn(sample: Callable, t0: Any, t1: Any, key: Array, index: Array) -> Samples:
-    """The trajectories numbered `index`. What of `args` depends neither on the number nor on the
-    key stays what all have in common."""
+def drawn(sample: Callable, t0: Any, t1: Any, key: Array, index: Array) -> dict[str, Any]:
+    """Arguments of `solve_ensemble`, for the trajectories numbered `index`. What of `args` depends
+    neither on the number nor on the key stays what all have in common."""
     keys = jax.vmap(jax.random.fold_in, in_axes=(None, 0))(key, index)
     own, common = _common(sample, index[0], keys[0])
 
@@ -34,13 +24,13 @@ def drawn(sample: Callable, t0: Any, t1: Any, key: Array, index: Array) -> Sampl
         return times, y0, eqx.filter(args, own)
 
     (t0s, t1s), y0s, args = jax.vmap(each)(index, keys)
-    return Samples(
-        t0 if t0s is None else t0s,
-        t1 if t1s is None else t1s,
-        y0s,
-        eqx.combine(args, common),
-        jtu.tree_map(lambda own: 0 if own else None, own),
-    )
+    return {
+        "t0": t0 if t0s is None else t0s,
+        "t1": t1 if t1s is None else t1s,
+        "y0s": y0s,
+        "args": eqx.combine(args, common),
+        "args_axes": jtu.tree_map(lambda own: 0 if own else None, own),
+    }
 
 
 def _common(sample: Callable, index: Array, key: Array) -> tuple[Any, Any]:

@@ -56,7 +56,7 @@ def check_settings(path: Any, stored: dict[str, Any], now: dict[str, Any]) -> No
         names = [name for name in names if name not in _IN_PROGRAM]
     if names == ["program"]:
         raise ValueError(
-            f"`out={str(path)!r}` was computed from another program: `terms`, the constraint or `sample` differ. Take "
+            f"`path={str(path)!r}` was computed from another program: `terms`, the constraint or `sample` differ. Take "
             "another folder, or those functions."
         )
     if names:
@@ -66,6 +66,6 @@ def check_settings(path: Any, stored: dict[str, Any], now: dict[str, Any]) -> No
             if name != "program"
         )
         raise ValueError(
-            f"`out={str(path)!r}` was computed with other settings: {was_and_is}. Take another folder, or those "
+            f"`path={str(path)!r}` was computed with other settings: {was_and_is}. Take another folder, or those "
             "settings."
         )

@@ -113,25 +113,28 @@ def solve_ensemble(
     warn_of_rounding(one.y0, batch.dtype, stepsize_controller)
     solver = without_idle_hook(solver, one.t0, one.y0, one.args)
     equations = Equations(
-        terms, solver, stepsize_controller, saveat, dt0, adjoint, max_steps, consistent
+        terms, solver, stepsize_controller, saveat, dt0, adjoint, max_steps, lanes, consistent
     )
 
     def solve(inputs: Inputs, axes: Axes = ()) -> EnsembleSolution:
         equations, batch = inputs
         saveat = checked_times(equations.saveat, batch, axes)
         dt0 = checked_step(equations.dt0, batch, axes)
-        inputs = dataclasses.replace(equations, saveat=saveat, dt0=dt0), batch
+        equations = dataclasses.replace(equations, saveat=saveat, dt0=dt0)
         try:
-            solution = solve_on_one_device(inputs, lanes)
+            solution = solve_on_one_device(Inputs(equations, batch))
         except Exception as error:
             if fault := fault_of_field(equations.terms, one.t0, one.y0, one.args):
                 raise ValueError(fault) from error
-            error.add_note(_example(inputs[1]))
+            error.add_note(_example(batch))
             raise
         solution = dataclasses.replace(solution, messages=messages_of(solver))
-        return _raise_if_any_failed(solution, axes) if throw else solution
+        if not throw:
+            return solution
+        number, failed = largest(solution.reasons(), axes), anywhere(solution.failed, axes)
+        return eqx.branched_error_if(solution, failed, number, solution.messages)
 
-    inputs = equations, batch
+    inputs = Inputs(equations, batch)
     return solve(inputs) if mesh is None else over_devices(solve, inputs, mesh)
 
 
@@ -142,8 +145,3 @@ def _example(batch: Batch) -> str:
         f"Of the {batch.size} trajectories of `y0s` each has a state of shapes {jtu.tree_map(jnp.shape, one.y0)}: the "
         "leading axes are the trajectories. One alone is solved by `mj.diffeqsolve`."
     )
-
-
-def _raise_if_any_failed(solution: EnsembleSolution, axes: Axes) -> EnsembleSolution:
-    number, failed = largest(solution.reasons(), axes), anywhere(solution.failed, axes)
-    return eqx.branched_error_if(solution, failed, number, solution.messages)

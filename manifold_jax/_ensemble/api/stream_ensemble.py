@@ -118,19 +118,24 @@ def stream_ensemble(
     chunk = min(_positive("chunk", chunk), size)
     key, folder = _key(seed), Path(path)
     _check_functions(sample, t0, t1)
-    parts = {"sample": sample, "terms": terms, "solver": solver, "t0": t0, "t1": t1, "dt0": dt0}
-    options = {
+    given = {
+        "sample": sample,
+        "terms": terms,
+        "solver": solver,
+        "t0": t0,
+        "t1": t1,
+        "dt0": dt0,
         "saveat": saveat,
         "stepsize_controller": stepsize_controller,
         "max_steps": max_steps,
         "lanes": lanes,
         "consistent": consistent,
     }
-    call = lambda start: (parts, options, key, jnp.asarray(start), size, chunk)
+    call = lambda start: (given, key, jnp.asarray(start), size, chunk)
     examples = eqx.filter_eval_shape(_solve_chunk, *call(0))
     named(examples)  # refuses names before anything is written
     lowered = _solve_chunk.lower(*call(0))
-    settings = {"size": size, "chunk": chunk, "seed": int(seed), **parts, **options}
+    settings = {"size": size, "chunk": chunk, "seed": int(seed), **given}
     described = settings_of(settings, lowered.as_text()) | {"checksums": "crc32c"}
     with clear_write_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
@@ -162,28 +167,15 @@ def _compute(stored: StoredEnsemble, lowered: Any, call: Callable, progress: boo
 
 @eqx.filter_jit
 def _solve_chunk(
-    parts: dict[str, Any], options: dict[str, Any], key: Array, start: Array, size: int, chunk: int
+    given: dict[str, Any], key: Array, start: Array, size: int, chunk: int
 ) -> dict[str, Any]:
     """The same program for every chunk: the last trajectory fills the last one up."""
     index = jnp.minimum(start + jnp.arange(chunk), size - 1)
-    samples = drawn(parts["sample"], parts["t0"], parts["t1"], key, index)
-    solution = solve_ensemble(
-        parts["terms"],
-        parts["solver"],
-        samples.t0,
-        samples.t1,
-        parts["dt0"],
-        samples.y0s,
-        samples.args,
-        args_axes=samples.args_axes,
-        **options,
-    )
-    return {
-        "ts": solution.ts,
-        "ys": solution.ys,
-        "stats": solution.stats,
-        "result": solution.reasons().astype(jnp.int8),
-    }
+    samples = drawn(given["sample"], given["t0"], given["t1"], key, index)
+    options = {name: x for name, x in given.items() if name != "sample"} | samples
+    solution = solve_ensemble(**options)
+    result = solution.reasons().astype(jnp.int8)
+    return {"ts": solution.ts, "ys": solution.ys, "stats": solution.stats, "result": result}
 
 
 def _opened(
@@ -197,13 +189,14 @@ def _opened(
     elif not resume:
         raise FileExistsError(
             errno.EEXIST,
-            f"`out={str(out)!r}` is not empty: take another folder, or `resume=True` to continue the ensemble there.",
+            f"`path={str(out)!r}` is not empty: take another folder, or `resume=True` to continue the ensemble there.",
         )
     else:
         stored = stored_at(out, "r+")
         if stored is None:
             raise FileExistsError(
-                errno.EEXIST, f"`out={str(out)!r}` is not empty, and holds no ensemble to continue."
+                errno.EEXIST,
+                f"`path={str(out)!r}` is not empty, and holds no ensemble to continue.",
             )
         check_settings(out, stored.settings, settings)
     clear_partial(out)

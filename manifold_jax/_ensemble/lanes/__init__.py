@@ -9,7 +9,7 @@ The life of a lane, with the file of each part:
 3. A lane whose trajectory has ended, or failed, writes its outcome and takes the next trajectory at
    once. The loop ends when there is none left.
 4. `forward.py` carries tangents along; `reverse.py` goes back over recorded segments of steps
-   (`records.py`), each step computed again and transposed.
+   (`records.py`), each step computed again and transposed. `functions.py` has what both differentiate.
 
 `columns.py` holds states as one column of lanes per number. `execution.py` decides between
 `in_lanes.py` and `mapped.py`, which is `diffeqsolve` under `jax.lax.map`; `solution.py` is what both return.

@@ -14,8 +14,8 @@ from jaxtyping import Array
 from ..._base.types import Args, Y
 from ..._constraint.checks import check_state
 from ..._solve.prepare import time_dtype
-from ..._solve.setup import Given
 from ..._solve.times import is_no_step, NO_FIRST_STEP, NO_OUTPUT_TIME
+from .trajectory import end_floor, Given
 
 
 # Names of the axes of a mesh over which trajectories are shared out; none on one device.
@@ -33,7 +33,7 @@ def anywhere(x: Array, axes: Axes) -> Array:
 
 
 class Batch(eqx.Module):
-    """`(t0, t1, y0, args)`, split into leaves with the trajectories in front, and common ones."""
+    """The fields of [`Given`][], split into leaves with the trajectories in front, and common ones."""
 
     each: Any
     common: Any
@@ -42,8 +42,9 @@ class Batch(eqx.Module):
 
     def complete(self, each: Any) -> Given:
         """Return the arguments of one trajectory, from its part of `each`."""
-        t0, t1, y0, args = eqx.combine(each, self.common)
-        return Given(jnp.asarray(t0, self.dtype), jnp.asarray(t1, self.dtype), y0, args)
+        given = eqx.combine(each, self.common)
+        t0, t1 = jnp.asarray(given.t0, self.dtype), jnp.asarray(given.t1, self.dtype)
+        return given._replace(t0=t0, t1=t1)
 
     def one(self) -> Given:
         """An example."""
@@ -58,22 +59,19 @@ def checked_batch(
         raise ValueError(f"`lanes` must be a positive integer, got {lanes!r}.")
     check_state(y0s, "y0s")
     y0s = jtu.tree_map(jnp.asarray, y0s)
-    sizes = {f"y0s{jtu.keystr(path)}": _size(x) for path, x in _leaves(y0s)}
-    which = jtu.tree_map(lambda _: True, y0s)
     timed = tuple(eqx.is_array(t) and t.ndim > 0 for t in (t0, t1))
-    for name, t, own in zip(("t0", "t1"), (t0, t1), timed, strict=True):
-        if own:
-            sizes[name] = _size(t)
-    axes_of_args = _axes(args_axes, args)
-    for (path, x), own in zip(_leaves(args), jtu.tree_leaves(axes_of_args), strict=True):
-        if own:
-            sizes[f"args{jtu.keystr(path)}"] = _size(x)
+    axes = jtu.tree_map(lambda _: True, y0s), _axes(args_axes, args)
+    mask = Given._make((*timed, *axes, any(timed)))
+    own = eqx.filter(Given._make((t0, t1, y0s, args, None)), mask)
+    parts = {"y0s": own.y0, "t0": own.t0, "t1": own.t1, "args": own.args}
+    leaves = [(name, x) for name in parts for x in jtu.tree_leaves_with_path(parts[name])]
+    sizes = {f"{name}{jtu.keystr(path)}": _size(x) for name, (path, x) in leaves}
     _check_sizes(sizes)
-    mask = (*timed, which, axes_of_args)
-    full = (t0, t1, y0s, args)
-    each, common = eqx.filter(full, mask), eqx.filter(full, mask, inverse=True)
-    times = [t if np.ndim(t) == 0 else t[0] for t in (t0, t1)]
-    return Batch(each, common, time_dtype(*times, dt0, saveat), next(iter(sizes.values())))  # pyright: ignore[reportArgumentType, reportCallIssue]
+    start, end = (t if np.ndim(t) == 0 else t[0] for t in (t0, t1))
+    dtype = time_dtype(start, end, dt0, saveat)
+    floor = end_floor(jnp.asarray(t0, dtype), jnp.asarray(t1, dtype))
+    each, common = eqx.partition(Given(t0, t1, y0s, args, floor), mask)
+    return Batch(each, common, dtype, next(iter(sizes.values())))  # pyright: ignore[reportArgumentType, reportCallIssue]
 
 
 def checked_step(dt0: Any, batch: Batch, axes: Axes) -> Any:
@@ -114,16 +112,11 @@ def checked_times(saveat: dfx.SaveAt, batch: Batch, axes: Axes) -> dfx.SaveAt:
 
 def _ends(batch: Batch) -> tuple[Array, Array]:
     """Return the ends of the time of each trajectory; where all have the same, of one: XLA takes
-    seconds to compute
-    while compiling what thousands of equal constants amount to."""
+    seconds to compute while compiling what thousands of equal constants amount to."""
     t0, t1, *_ = batch.common
     if t0 is not None and t1 is not None:
         return jnp.asarray(t0, batch.dtype)[None], jnp.asarray(t1, batch.dtype)[None]
     return jax.vmap(lambda each: batch.complete(each)[:2])(batch.each)
-
-
-def _leaves(tree: Any) -> list[tuple[Any, Any]]:
-    return jtu.tree_flatten_with_path(tree)[0]
 
 
 def _size(x: Any) -> int | None:

@@ -1,116 +1,61 @@
-"""Trees of values as lists of columns, one number of each lane or each trajectory."""
+"""Columns, one number of each lane or each trajectory, stacked and in tables."""
 
-import math
-from typing import Any, NamedTuple
+from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 
-from ..._jaxpr.lane_arrays import Lanes
-from ..._jaxpr.lane_value import object_array, Value
-from ..._jaxpr.trace import example
+from ..._jaxpr.lane_value import Columns, Layout
 
 
-class Layout(NamedTuple):
-    """How columns make up a tree."""
+def taken(tree: Any, index: jax.Array) -> Any:
+    return jtu.tree_map(lambda x: x[index], tree)
 
-    treedef: Any
-    shapes: list[tuple[int, ...]]
-    dtypes: list[Any]
+
+def added(totals: Any, more: Any, active: jax.Array) -> Any:
+    return jtu.tree_map(lambda a, b: a + jnp.where(active, b, 0), totals, more)
+
+
+class Stacked(eqx.Module):
+    """Columns as one array for each type of number; with further leading axes many of them."""
+
+    arrays: dict[str, jax.Array]
+    layout: Layout = eqx.field(static=True)
 
     @staticmethod
-    def of(tree: Any) -> "Layout":
-        """Return the layout of a tree of [`Value`][]s, or of arrays of one trajectory."""
-        leaves, treedef = jtu.tree_flatten(tree)
-        return Layout(treedef, [x.shape for x in leaves], [x.dtype for x in leaves])
+    def of(columns: Columns) -> "Stacked":
+        groups: dict[str, list[jax.Array]] = {}
+        for column in columns.columns:
+            groups.setdefault(str(column.dtype), []).append(column)
+        arrays = {dtype: jnp.stack(group) for dtype, group in groups.items()}
+        return Stacked(arrays, columns.layout)
 
-    @staticmethod
-    def of_one(tree: Any) -> "Layout":
-        """Return the layout of one of the trajectories that arrays have in front."""
-        return Layout.of(jtu.tree_map(lambda x: example(x.shape[1:], x.dtype), tree))
-
-    def dtypes_of_columns(self) -> list[Any]:
-        each = zip(self.shapes, self.dtypes, strict=True)
-        return [dtype for shape, dtype in each for _ in range(math.prod(shape))]
-
-    def example(self) -> Any:
-        """Return an example to trace functions of one trajectory with."""
-        leaves = [example(s, d) for s, d in zip(self.shapes, self.dtypes, strict=True)]
-        return jtu.tree_unflatten(self.treedef, leaves)
-
-    def values(self, columns: list[jax.Array]) -> Any:
-        out, k = [], 0
-        for shape, dtype in zip(self.shapes, self.dtypes, strict=True):
-            size = int(np.prod(shape))
-            out.append(Value.of_numbers(object_array(columns[k : k + size], shape), dtype))
-            k += size
-        return jtu.tree_unflatten(self.treedef, out)
-
-    def arrays(self, columns: list[jax.Array]) -> Any:
-        """Return the arrays of columns, with the trajectories in front."""
-        out, k = [], 0
-        rows = columns[0].shape[0] if columns else 0
-        for shape, dtype in zip(self.shapes, self.dtypes, strict=True):
-            size = int(np.prod(shape))
-            found = jnp.stack(columns[k : k + size], axis=1) if size else jnp.zeros(0, dtype)
-            out.append(found.reshape(rows, *shape))
-            k += size
-        return jtu.tree_unflatten(self.treedef, out)
+    def columns(self) -> Columns:
+        rows = {dtype: iter(stack) for dtype, stack in self.arrays.items()}
+        dtypes = self.layout.dtypes_of_columns()
+        return Columns([next(rows[str(dtype)]) for dtype in dtypes], self.layout)
 
 
-def columns_of_values(tree: Any, lanes: Lanes) -> list[jax.Array]:
-    return [column for value in jtu.tree_leaves(tree) for column in value.columns(lanes)]
+def unknown(dtype: Any) -> Any:
+    """Return what stands where nothing was computed: infinity, where numbers can be infinite."""
+    return np.inf if jnp.issubdtype(dtype, jnp.floating) else 0
 
 
-def columns_of_arrays(tree: Any) -> list[jax.Array]:
-    """Return the columns of arrays with the trajectories in front."""
-    flat = lambda leaf: leaf.reshape(leaf.shape[0], math.prod(leaf.shape[1:]))
-    return [column for leaf in jtu.tree_leaves(tree) for column in flat(leaf).T]
+def empty_table(layout: Layout, rows: int) -> Stacked:
+    """A table of `rows` trees, each a row of the array of each type of number."""
+    dtypes = [str(dtype) for dtype in layout.dtypes_of_columns()]
+    full = lambda dtype: jnp.full((rows, dtypes.count(dtype)), unknown(dtype), dtype)
+    return Stacked({dtype: full(dtype) for dtype in dict.fromkeys(dtypes)}, layout)
 
 
-def taken(columns: list[jax.Array], index: jax.Array) -> list[jax.Array]:
-    return [column[index] for column in columns]
-
-
-def where(chosen: jax.Array, a: list[jax.Array], b: list[jax.Array]) -> list[jax.Array]:
-    return [jax.lax.select(chosen, x, y) for x, y in zip(a, b, strict=True)]
-
-
-def added(totals: list[jax.Array], more: list[jax.Array], active: jax.Array) -> list[jax.Array]:
-    return [a + jnp.where(active, b, 0) for a, b in zip(totals, more, strict=True)]
-
-
-def stacked(columns: list[jax.Array]) -> dict[str, jax.Array]:
-    """One array for each type of number."""
-    groups: dict[str, list[jax.Array]] = {}
-    for column in columns:
-        groups.setdefault(str(column.dtype), []).append(column)
-    return {dtype: jnp.stack(group) for dtype, group in groups.items()}
-
-
-def unstacked(stacks: dict[str, jax.Array], dtypes: list[Any]) -> list[jax.Array]:
-    rows = {dtype: iter(stack) for dtype, stack in stacks.items()}
-    return [next(rows[str(dtype)]) for dtype in dtypes]
-
-
-def empty_table(layout: Layout, rows: int) -> dict[str, jax.Array]:
-    """One array for each type of number, `(rows, columns)`; infinite where numbers can be."""
-    counts: dict[str, int] = {}
-    for shape, dtype in zip(layout.shapes, layout.dtypes, strict=True):
-        counts[str(dtype)] = counts.get(str(dtype), 0) + int(np.prod(shape))
-    unknown = lambda dtype: np.inf if jnp.issubdtype(dtype, jnp.floating) else 0
-    return {dtype: jnp.full((rows, k), unknown(dtype), dtype) for dtype, k in counts.items()}
-
-
-def written(
-    table: dict[str, jax.Array], place: jax.Array, columns: list[jax.Array]
-) -> dict[str, jax.Array]:
+def written(table: Stacked, place: jax.Array, columns: Columns) -> Stacked:
     """Numbers of each lane in a row of their own; none where `place` is behind the last one."""
-    new = stacked(columns)
-    return {dtype: x.at[place].set(new[dtype].T, mode="drop") for dtype, x in table.items()}
+    write = lambda x, new: x.at[place].set(new.T, mode="drop")
+    return Stacked(jtu.tree_map(write, table.arrays, Stacked.of(columns).arrays), table.layout)
 
 
-def read(table: dict[str, jax.Array], place: jax.Array, dtypes: list[Any]) -> list[jax.Array]:
-    return unstacked({dtype: x[place].T for dtype, x in table.items()}, dtypes)
+def read(table: Stacked, place: jax.Array) -> Columns:
+    return jtu.tree_map(lambda x: x[place].T, table).columns()

@@ -24,34 +24,25 @@ from .solution import EnsembleSolution
 LARGEST_STIFF = 8
 
 
-def solve_on_one_device(inputs: Inputs, lanes: int) -> EnsembleSolution:
-    inputs = _with_hook(inputs)
+def solve_on_one_device(inputs: Inputs) -> EnsembleSolution:
+    solver = inputs.equations.solver
+    if not isinstance(solver, AbstractManifoldSolver):
+        # Lanes advance solvers of this library, of which one leaves states as they are.
+        inputs = inputs.with_solver(Unconstrained(solver))
     obstacle = _obstacle(inputs)
     if obstacle is None:
-        forwards = isinstance(inputs[0].adjoint, dfx.ForwardMode)
+        forwards = isinstance(inputs.equations.adjoint, dfx.ForwardMode)
         solve = solve_in_lanes_forwards if forwards else solve_in_lanes
+        written_out, inner = inputs, inputs.equations.solver.inner
+        if isinstance(inner, AbstractRosenbrock):
+            inner = dataclasses.replace(inner, largest_written_out=LARGEST_STIFF)
+            written_out = inputs.with_solver(Unconstrained(inner))
         try:
-            return solve(_with_written_out_elimination(inputs), lanes)
+            return solve(written_out)
         except NotScalarError as error:
             obstacle = str(error)
     execution = f"mapped over, not in lanes: {obstacle}"
-    return dataclasses.replace(solve_mapped(inputs, lanes), execution=execution)
-
-
-def _with_hook(inputs: Inputs) -> Inputs:
-    """Lanes advance solvers of this library, of which one leaves states as they are."""
-    equations, batch = inputs
-    if isinstance(equations.solver, AbstractManifoldSolver):
-        return inputs
-    return dataclasses.replace(equations, solver=Unconstrained(equations.solver)), batch
-
-
-def _with_written_out_elimination(inputs: Inputs) -> Inputs:
-    equations, batch = inputs
-    if not isinstance(equations.solver.inner, AbstractRosenbrock):
-        return inputs
-    inner = dataclasses.replace(equations.solver.inner, largest_written_out=LARGEST_STIFF)
-    return dataclasses.replace(equations, solver=Unconstrained(inner)), batch
+    return dataclasses.replace(solve_mapped(inputs), execution=execution)
 
 
 def _obstacle(inputs: Inputs) -> str | None:

@@ -1,107 +1,59 @@
-"""What is done in each lane in the reverse sweep, as functions of one trajectory."""
+"""What a trajectory does, as functions that are differentiated.
 
-from collections.abc import Callable
+Each is a `function(equations, given, x, ...)` of what steps depend on, `x`, and returns the real
+numbers among its results, and all of them.
+"""
+
 from typing import Any
 
 import equinox as eqx
-import jax
-import jax.numpy as jnp
-import jax.tree_util as jtu
 
-from ..._adjoint.replay import memory_of, with_memory
+from ..._adjoint.replay import memory_of, Solve, State
 from ..._base.compat import directed
-from ..._base.types import BoolScalar, FloatScalar
-from .parts import Parts
-from .trajectory import Attempt, Trajectory
+from ..._base.types import FloatScalar
+from .trajectory import Equations, Given, Trajectory
 
 
-def step_state(trajectory: Trajectory) -> Any:
+def step_state(trajectory: Trajectory) -> State:
     """Return what a step depends on: the state, and what the solver remembers."""
-    return trajectory.y, memory_of(trajectory.solver_state)
+    return State(trajectory.y, memory_of(trajectory.solver_state))
 
 
-def smooth_part(step_state: Any) -> Any:
+def smooth_part(tree: Any) -> Any:
     """Return the leaves with respect to which a step has derivatives; the others are `None`."""
-    return eqx.filter(step_state, eqx.is_inexact_array)
+    return eqx.filter(tree, eqx.is_inexact_array)
 
 
-class Functions:
-    """Functions of `(each, common, rest_each)`, see [`Parts`][], and what their names say."""
+def begin(equations: Equations, given: Given, x: None) -> tuple[Any, Any]:
+    """The state before the first step; and the start."""
+    start = equations.begin(given)
+    return smooth_part(step_state(start.trajectory)), start
 
-    def __init__(self, parts: Parts, solver_state: Any):
-        """`solver_state`: an example."""
-        self.parts = parts
-        self.solver_state = jtu.tree_map(jnp.zeros_like, solver_state)
 
-    def goes_on(self, each: Any, common: Any, rest: Any, trajectory: Trajectory) -> BoolScalar:
-        equations, given = self.parts.one(each, common, rest)
-        return equations.goes_on(given, trajectory)
+def step(
+    equations: Equations, given: Given, smooth: State, rest: State, solver_state: Any, *ends: Any
+) -> tuple[Any, Any]:
+    """The state behind a step and the data of its interpolation; and these data. `solver_state` is
+    one for what is not remembered of it."""
+    terms, (start, end) = directed(equations.terms, given.direction), ends
+    solve = Solve(terms, equations.solver, given.args, solver_state, remembers=True, jumps=False)
+    after, dense_info = solve.attempt(start, end, False, eqx.combine(smooth, rest))
+    return (smooth_part(after), dense_info), dense_info
 
-    def attempt(self, each: Any, common: Any, rest: Any, trajectory: Trajectory) -> Attempt:
-        equations, given = self.parts.one(each, common, rest)
-        return equations.attempt(given, trajectory)
 
-    def direction(self, each: Any, common: Any, rest: Any) -> FloatScalar:
-        _, given = self.parts.one(each, common, rest)
-        return given.direction
+def interpolate(
+    equations: Equations,
+    given: Given,
+    dense_info: Any,
+    t: FloatScalar,
+    start: FloatScalar,
+    end: FloatScalar,
+) -> tuple[Any, None]:
+    """The state at a time in a step."""
+    return equations.interpolated(t, start, end, dense_info), None
 
-    def through_start(self, each: Any, common: Any, rest: Any, bar: Any) -> Any:
-        """Cotangents of `each` and `common`, from that of the state before the first step."""
 
-        def start(each: Any, common: Any) -> Any:
-            equations, given = self.parts.one(each, common, rest)
-            return smooth_part(step_state(equations.begin(given).trajectory))
-
-        return jax.vjp(start, each, common)[1](bar)
-
-    def step(
-        self, each: Any, common: Any, rest: Any, start: FloatScalar, end: FloatScalar, state: Any
-    ) -> tuple[Any, Callable]:
-        """The data of the interpolation in a step, and what takes cotangents of the smooth part of
-        the state behind it and of these data to those of `each`, `common` and `state`."""
-        smooth, discrete = eqx.partition(state, eqx.is_inexact_array)
-
-        def step(each: Any, common: Any, smooth: Any) -> Any:
-            equations, given = self.parts.one(each, common, rest)
-            y, memory = eqx.combine(smooth, discrete)
-            y, _, dense_info, solver_state, _ = equations.solver.step(
-                directed(equations.terms, given.direction),
-                start,
-                end,
-                y,
-                given.args,
-                with_memory(self.solver_state, memory),
-                False,
-            )
-            return smooth_part((y, memory_of(solver_state))), dense_info
-
-        (_, dense_info), pullback = jax.vjp(step, each, common, smooth)
-        return dense_info, pullback
-
-    def through_interpolated(
-        self,
-        each: Any,
-        common: Any,
-        rest: Any,
-        t: FloatScalar,
-        start: FloatScalar,
-        end: FloatScalar,
-        dense_info: Any,
-        bar: Any,
-    ) -> Any:
-        """The cotangent of `dense_info`, from that of the state interpolated at `t`."""
-        equations, _ = self.parts.one(each, common, rest)
-        interpolated = lambda info: equations.interpolated(t, start, end, info)
-        return jax.vjp(interpolated, dense_info)[1](bar)[0]
-
-    def through_handed_out(
-        self, each: Any, common: Any, rest: Any, t: FloatScalar, y: Any, bar: Any
-    ) -> Any:
-        """Cotangents of `each`, `common` and `y`, from that of what is saved of it at the time `t`."""
-
-        def value(each: Any, common: Any, y: Any) -> Any:
-            equations, given = self.parts.one(each, common, rest)
-            value, _ = equations.saved_value(given, t, y)
-            return eqx.filter(value, eqx.is_inexact_array)
-
-        return jax.vjp(value, each, common, y)[1](bar)
+def save(equations: Equations, given: Given, y: Any, t: FloatScalar) -> tuple[Any, Any]:
+    """What is saved of a state at time `t`; and whether it is on the manifold."""
+    value, success = equations.saved_value(given, t, y)
+    return smooth_part(value), (value, success)

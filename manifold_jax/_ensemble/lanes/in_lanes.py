@@ -1,5 +1,8 @@
 """Many trajectories in lanes, with their derivatives."""
 
+import contextlib
+import dataclasses
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -7,7 +10,9 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 from diffrax import RESULTS
+from jaxtyping import Array
 
+from ..._adjoint.gradient import with_zeros
 from ..._base.compat import nonlinear_failure, update_result
 from ..._base.types import BoolScalar
 from ..._jaxpr.lane_arrays import NotScalarError
@@ -16,8 +21,9 @@ from ..._solver.unconstrained import Unconstrained
 from .forward import tangents_in_lanes
 from .mapped import gradient_of_mapped, tangents_of_mapped
 from .parts import in_steps, Inputs, Parts, times_are_differentiated
-from .reverse import Ends, ReverseSweep
-from .rows import saved_rows
+from .records import Ends
+from .reverse import ReverseSweep
+from .rows import saved_rows, smooth_rows
 from .schedule import Run, Schedule
 from .solution import EnsembleSolution
 
@@ -27,31 +33,20 @@ _MOST_IN_COMMON = 200
 
 
 def gradient_in_lanes(
-    inputs: Inputs, differentiated: Any, run: Run, bar: Any, lanes: int, limit: int
-) -> Any:
+    inputs: Inputs, differentiated: Any, run: Run, bar: Any, limit: int
+) -> Inputs:
     """`bar`: cotangents of times and values; `differentiated`: a tree of truth values."""
     parts = Parts.of(inputs, differentiated)
-    if parts.num_common() > _MOST_IN_COMMON:
+    if sum(x.size for x in jtu.tree_leaves(parts.common)) > _MOST_IN_COMMON:
         raise NotScalarError("too many numbers in common")
-
-    smooth_values, others = eqx.partition(run.values, eqx.is_inexact_array)
-
-    def saved(each: Any, common: Any, first: Any, last: Any, smooth_values: Any) -> Any:
-        equations, batch = parts.inputs(each, common)
-        values = eqx.combine(smooth_values, others)
-        start = run.start._replace(trajectory=run.start.trajectory._replace(y=first))
-        outcome = run.outcome._replace(y=last)
-        new = run._replace(start=start, outcome=outcome, values=values)
-        return eqx.filter(saved_rows(equations.saveat.subs, batch, new), eqx.is_inexact_array)
-
-    saved_value = run.start.trajectory.y, run.outcome.y, smooth_values
-    rows, pullback = jax.vjp(saved, parts.each, parts.common, *saved_value)
-    bar = jtu.tree_map(lambda x, b: jnp.zeros_like(x) if b is None else b, rows, bar)
-    each, common, *bars = pullback(bar)
+    saved, smooth = smooth_rows(parts, run.rows, run.outcome.t, run.values)
+    at = parts.each, parts.common, run.start.trajectory.y, run.outcome.y, smooth
+    values, pullback = jax.vjp(saved, *at)
+    each, common, *bars = pullback(with_zeros(values, bar))
     ends = Ends(run.start.trajectory, run.outcome.num_steps, run.rows, run.states, *bars)
-    more = ReverseSweep(parts, ends, lanes, limit).run()
+    more = ReverseSweep(parts, ends, limit).run()
     each, common = jtu.tree_map(jnp.add, (each, common), more)
-    return parts.together(each, common)
+    return common._replace(batch=dataclasses.replace(common.batch, each=each))
 
 
 # Operations on one number, of a start and a step, beyond which trajectories are mapped over instead. A
@@ -62,15 +57,15 @@ _LONGEST_BACK = 5 * _LONGEST
 
 
 @eqx.filter_custom_vjp
-def solve_in_lanes(inputs: Inputs, lanes: int) -> EnsembleSolution:
-    solution, _ = _run(inputs, lanes)
+def solve_in_lanes(inputs: Inputs) -> EnsembleSolution:
+    solution, _ = _run(inputs)
     return solution
 
 
-def _run(inputs: Inputs, lanes: int) -> tuple[EnsembleSolution, Run]:
+def _run(inputs: Inputs) -> tuple[EnsembleSolution, Run]:
     equations, batch = inputs
     equations = in_steps(equations)
-    run = Schedule(equations, batch.each, batch.complete, lanes, _LONGEST).run()
+    run = Schedule(equations, batch.each, batch.complete, _LONGEST).run()
     outcome, statistics = run.outcome, run.outcome.statistics
     stats = {
         "num_steps": outcome.num_steps,
@@ -84,60 +79,60 @@ def _run(inputs: Inputs, lanes: int) -> tuple[EnsembleSolution, Run]:
             "largest_correction": statistics.largest_correction,
             "correction_share": jax.vmap(lambda s: s.correction_share)(statistics),
         }
-    ts, ys = saved_rows(equations.saveat.subs, batch, run)
-    result = jax.vmap(_unless_failed)(outcome.result, run.failed)
-    if not equations.solver.corrects_output:
-        finite = jax.vmap(lambda ts, ys: result_of_saved(equations.saveat, ts, ys))(ts, ys)
-        result = jax.vmap(update_result)(result, finite)
+    ends = run.start.trajectory.y, outcome.y
+    ts, ys = saved_rows(equations.saveat.subs, batch, run.rows, outcome.t, *ends, run.values)
+
+    def with_values(result: RESULTS, failed: BoolScalar, ts: Array, ys: Any) -> RESULTS:
+        failure = RESULTS.where(failed, nonlinear_failure(), RESULTS.successful)
+        result = update_result(result, failure)
+        if equations.solver.corrects_output:
+            return result
+        return update_result(result, result_of_saved(equations.saveat, ts, ys))
+
+    result = jax.vmap(with_values)(outcome.result, run.failed, ts, ys)
     return EnsembleSolution(ts, ys, stats, result), run
 
 
-def _unless_failed(result: RESULTS, failed: BoolScalar) -> RESULTS:
-    """`failed`: whether a value could not be corrected."""
-    failure = RESULTS.where(failed, nonlinear_failure(), RESULTS.successful)
-    return update_result(result, failure)
-
-
 @solve_in_lanes.def_fwd
-def _forward(perturbed, inputs, lanes):
+def _forward(perturbed, inputs):
     del perturbed
-    return _run(inputs, lanes)
+    return _run(inputs)
 
 
 @solve_in_lanes.def_bwd
-def _backward(run, cotangents, perturbed, inputs, lanes):
+def _backward(run, cotangents, perturbed, inputs):
     bar = cotangents.ts, cotangents.ys
-    if not times_are_differentiated(perturbed):
-        try:
-            return gradient_in_lanes(inputs, perturbed, run, bar, lanes, _LONGEST_BACK)
-        except NotScalarError:
-            pass
-    return gradient_of_mapped(inputs, perturbed, bar, lanes)
+    return _in_lanes_or_mapped(
+        perturbed,
+        lambda: gradient_in_lanes(inputs, perturbed, run, bar, _LONGEST_BACK),
+        lambda: gradient_of_mapped(inputs, perturbed, bar),
+    )
+
+
+def _in_lanes_or_mapped(differentiated: Any, in_lanes: Callable, mapped: Callable) -> Any:
+    """`in_lanes()`, or `mapped()` for derivatives of times, and where lanes would take too long."""
+    if not times_are_differentiated(differentiated):
+        with contextlib.suppress(NotScalarError):
+            return in_lanes()
+    return mapped()
 
 
 @eqx.filter_custom_jvp
-def solve_in_lanes_forwards(inputs: Inputs, lanes: int) -> EnsembleSolution:
+def solve_in_lanes_forwards(inputs: Inputs) -> EnsembleSolution:
     """Solve in lanes, differentiated in forward mode."""
-    solution, _ = _run(inputs, lanes)
+    solution, _ = _run(inputs)
     return solution
 
 
 @solve_in_lanes_forwards.def_jvp
 def _tangents(primals, tangents):
-    (inputs, lanes), (tangents, _) = primals, tangents
-    solution, _ = _run(inputs, lanes)
+    (inputs,), (tangents,) = primals, tangents
+    solution, _ = _run(inputs)
     differentiated = jtu.tree_map(lambda x: x is not None, tangents, is_leaf=lambda x: x is None)
-    along = None
-    if not times_are_differentiated(differentiated):
-        try:
-            along = tangents_in_lanes(inputs, tangents, lanes, _LONGEST_BACK)
-        except NotScalarError:
-            pass
-    if along is None:
-        along = tangents_of_mapped(inputs, tangents, lanes)
-    ts, ys = along
-    return solution, EnsembleSolution(ts, ys, *_none((solution.stats, solution.result)))
-
-
-def _none(tree: Any) -> Any:
-    return jtu.tree_map(lambda _: None, tree)
+    along = _in_lanes_or_mapped(
+        differentiated,
+        lambda: tangents_in_lanes(inputs, differentiated, tangents, _LONGEST_BACK),
+        lambda: tangents_of_mapped(inputs, tangents),
+    )
+    none = jtu.tree_map(lambda _: None, (solution.stats, solution.result))
+    return solution, EnsembleSolution(*along, *none)

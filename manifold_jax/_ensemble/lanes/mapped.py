@@ -4,28 +4,26 @@ from typing import Any
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
-import jax.tree_util as jtu
 
+from ..._adjoint.gradient import with_zeros
 from ..._solve.diffeqsolve import diffeqsolve
 from ..._solver.unconstrained import Unconstrained
 from .parts import Inputs
 from .solution import EnsembleSolution
 
 
-def solve_mapped(inputs: Inputs, lanes: int) -> EnsembleSolution:
+def solve_mapped(inputs: Inputs) -> EnsembleSolution:
     equations, batch = inputs
     solver = equations.solver
     solver = solver.inner if isinstance(solver, Unconstrained) else solver
 
     def one(of_each: Any) -> tuple[Any, ...]:
         given = batch.complete(of_each)
+        times = given.t0, given.t1, equations.dt0
         sol = diffeqsolve(
             equations.terms,
             solver,
-            given.t0,
-            given.t1,
-            equations.dt0,
+            *times,
             given.y0,
             given.args,
             saveat=equations.saveat,
@@ -38,29 +36,25 @@ def solve_mapped(inputs: Inputs, lanes: int) -> EnsembleSolution:
         stats = {name: x for name, x in sol.stats.items() if name != "max_steps"}
         return sol.ts, sol.ys, stats, sol.result
 
-    return EnsembleSolution(*jax.lax.map(one, batch.each, batch_size=min(lanes, batch.size)))
+    at_a_time = min(equations.lanes, batch.size)
+    return EnsembleSolution(*jax.lax.map(one, batch.each, batch_size=at_a_time))
 
 
-def gradient_of_mapped(inputs: Inputs, differentiated: Any, bar: Any, lanes: int) -> Any:
+def _times_and_values(inputs: Inputs) -> Any:
+    solution = solve_mapped(inputs)
+    return eqx.filter((solution.ts, solution.ys), eqx.is_inexact_array)
+
+
+def gradient_of_mapped(inputs: Inputs, differentiated: Any, bar: Any) -> Any:
     """Return the gradient from the cotangents of times and values, each trajectory by the reverse
     sweep of `diffeqsolve`."""
     smooth, rest = eqx.partition(inputs, differentiated)
-
-    def saved(smooth: Any) -> Any:
-        solution = solve_mapped(eqx.combine(smooth, rest), lanes)
-        return eqx.filter((solution.ts, solution.ys), eqx.is_inexact_array)
-
+    saved = lambda smooth: _times_and_values(eqx.combine(smooth, rest))
     values, pullback = jax.vjp(saved, smooth)
-    bar = jtu.tree_map(lambda x, b: jnp.zeros_like(x) if b is None else b, values, bar)
-    return pullback(bar)[0]
+    return pullback(with_zeros(values, bar))[0]
 
 
-def tangents_of_mapped(inputs: Inputs, tangents: Any, lanes: int) -> Any:
+def tangents_of_mapped(inputs: Inputs, tangents: Any) -> Any:
     """Return the tangents of times and values; `tangents` of the inputs have `None` where there is
     none."""
-
-    def saved(inputs: Inputs) -> Any:
-        solution = solve_mapped(inputs, lanes)
-        return solution.ts, solution.ys
-
-    return eqx.filter_jvp(saved, (inputs,), (tangents,))[1]
+    return eqx.filter_jvp(_times_and_values, (inputs,), (tangents,))[1]

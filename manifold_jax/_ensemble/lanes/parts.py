@@ -1,18 +1,25 @@
 """What an ensemble is solved from, by what has derivatives."""
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
-import jax.tree_util as jtu
 
-from ..._solve.setup import Given
+from ..._adjoint.replay import subs_of
 from .arguments import Batch
-from .trajectory import Equations
+from .trajectory import Equations, Given
 
 
-Inputs = tuple[Equations, Batch]
+class Inputs(NamedTuple):
+    """What all trajectories have in common, and what each has of its own."""
+
+    equations: Equations
+    batch: Batch
+
+    def with_solver(self, solver: Any) -> "Inputs":
+        return self._replace(equations=dataclasses.replace(self.equations, solver=solver))
 
 
 class Parts(NamedTuple):
@@ -28,25 +35,22 @@ class Parts(NamedTuple):
     def of(inputs: Inputs, differentiated: Any) -> "Parts":
         """`differentiated`: a tree of truth values."""
         smooth, rest = eqx.partition(inputs, differentiated)
-        without = lambda x: (x[0], dataclasses.replace(x[1], each=None))
-        return Parts(smooth[1].each, without(smooth), rest[1].each, without(rest))
+        without = lambda x: x._replace(batch=dataclasses.replace(x.batch, each=None))
+        return Parts(smooth.batch.each, without(smooth), rest.batch.each, without(rest))
 
     def one(self, each: Any, common: Any, rest_each: Any) -> tuple[Equations, Given]:
         """A trajectory and what it is solved by."""
         equations, batch = eqx.combine(common, self.rest)
         return in_steps(equations), batch.complete(eqx.combine(each, rest_each))
 
+    def smooth(self, function: Callable, rest_each: Any, *args: Any) -> Callable:
+        """`function(equations, given, x, *args)` as a function of what it is differentiated with
+        respect to: `each`, `common` and `x`."""
+        return lambda each, common, x: function(*self.one(each, common, rest_each), x, *args)
+
     def inputs(self, each: Any, common: Any) -> Inputs:
         equations, batch = eqx.combine(common, self.rest)
-        return equations, dataclasses.replace(batch, each=eqx.combine(each, self.rest_each))
-
-    def together(self, each: Any, common: Any) -> Inputs:
-        """Return a tree of the structure of the inputs, without what is not differentiated."""
-        equations, batch = common
-        return equations, dataclasses.replace(batch, each=each)
-
-    def num_common(self) -> int:
-        return sum(x.size for x in jtu.tree_leaves(self.common))
+        return Inputs(equations, dataclasses.replace(batch, each=eqx.combine(each, self.rest_each)))
 
 
 def in_steps(equations: Equations) -> Equations:
@@ -58,15 +62,6 @@ def in_steps(equations: Equations) -> Equations:
 def times_are_differentiated(differentiated: Any) -> bool:
     """Whether any of the times, step sizes or tolerances is."""
     equations, batch = differentiated
-    timed = (
-        batch.each[:2],
-        batch.common[:2],
-        equations.dt0,
-        equations.controller,
-        [sub.ts for sub in jtu.tree_leaves(equations.saveat.subs, is_leaf=_is_sub)],
-    )
-    return any(x is True for x in jax.tree.leaves(timed))
-
-
-def _is_sub(x: Any) -> bool:
-    return hasattr(x, "ts")
+    subs = subs_of(equations.saveat)
+    timed = batch.each[:2], batch.common[:2], equations.dt0, equations.controller
+    return any(x is True for x in jax.tree.leaves((timed, [sub.ts for sub in subs])))

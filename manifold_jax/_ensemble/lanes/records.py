@@ -4,54 +4,48 @@ from typing import Any, NamedTuple
 
 from jaxtyping import Array
 
-from .columns import stacked
+from ..._jaxpr.lane_value import Columns
+from .columns import Stacked
 from .trajectory import Trajectory
 
 
 class Ends(NamedTuple):
     """The ends of all trajectories, in front of every array: the states they begin with, numbers
-    of steps and of
-    saved rows, and the table of states there (see [`Run`][]); cotangents of the first and the last
-    states and of the values at `ts`."""
+    of steps and of saved rows, and the table of states there (see [`Run`][]); cotangents of the
+    first and the last states and of the values at `ts`."""
 
     start: Trajectory
     num_steps: Array
     rows: Array
-    states: dict[str, Array]
+    states: Stacked | None
     first_bar: Any
     last_bar: Any
     values_bar: Any
 
 
 class Group(NamedTuple):
-    """Columns of those that go together: which they are, and whether anything depends on them; the
-    cotangents of their states at `ts`, time by time."""
+    """Those that go together: which they are, and whether anything depends on them; what they are
+    given; the cotangents of their states at `ts`, time by time."""
 
     index: Array
     present: Array
-    each: list[Array]
-    rest: list[Array]
-    at_times: dict[str, Array]
+    each: Columns
+    rest: Columns
+    at_times: Stacked | None
 
 
 class Bars(NamedTuple):
-    """Columns of cotangents so far, of the state and of what steps depend on; which of the times to
-    save at is the last one still to come."""
+    """Cotangents so far, of the state and of what steps depend on; which of the times to save at is
+    the last one still to come."""
 
-    state: list[Array]
-    each: list[Array]
-    common: list[Array]
+    state: Columns
+    each: Columns
+    common: Columns
     row: Array
 
 
 class Record(NamedTuple):
-    """A record of the steps of a segment: where they begin and end, from which state; which were
-    accepted."""
+    """The steps of a segment: where they begin and end, from which state; which were accepted."""
 
-    steps: dict[str, Array]
+    steps: Stacked
     accepted: Array
-
-    def with_row(self, row: Array, columns: list[Array], accepted: Array) -> "Record":
-        new = stacked(columns)
-        steps = {dtype: x.at[row].set(new[dtype]) for dtype, x in self.steps.items()}
-        return Record(steps, self.accepted.at[row].set(accepted))

@@ -7,28 +7,23 @@ recorded for one segment of the steps at a time; of the others there is the firs
 from collections.abc import Callable
 from typing import Any
 
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 from jax import lax
 from jaxtyping import Array
 
+from ..._adjoint.record import rows_backwards
+from ..._adjoint.replay import State
 from ..._jaxpr.lane_arrays import Lanes
 from ..._jaxpr.lane_interpreter import call_in_lanes
-from ..._jaxpr.lane_value import Value
-from .columns import (
-    added,
-    columns_of_arrays,
-    columns_of_values,
-    Layout,
-    read,
-    stacked,
-    taken,
-    unstacked,
-    where,
-)
-from .functions import Functions, smooth_part, step_state
+from ..._jaxpr.lane_value import Columns, Layout, Value, where
+from .columns import added, read, Stacked, taken
+from .functions import begin, interpolate, save, smooth_part, step, step_state
 from .parts import Parts
 from .records import Bars, Ends, Group, Record
+from .trajectory import Equations
 
 
 # Of the record of a segment.
@@ -36,29 +31,23 @@ _BYTES = 2**22
 
 
 class ReverseSweep:
-    def __init__(self, parts: Parts, ends: Ends, lanes: int, limit: int):
+    def __init__(self, parts: Parts, ends: Ends, limit: int):
         self.parts, self.ends = parts, ends
-        self.functions = Functions(parts, jtu.tree_map(lambda x: x[0], ends.start.solver_state))
+        equations = parts.rest.equations
+        self.max_steps, self.ts = equations.max_steps, equations.saveat.subs.ts
         self.size = ends.num_steps.size
-        self.lanes = Lanes(min(lanes, self.size), limit)
-        self.each, self.rest = (columns_of_arrays(x) for x in (parts.each, parts.rest_each))
-        self.each_layout, self.rest_layout = (
-            Layout.of_one(x) for x in (parts.each, parts.rest_each)
-        )
-        self.starts, self.state_layout = columns_of_arrays(ends.start), Layout.of_one(ends.start)
-        remembered = step_state(ends.start)
-        self.step_layout = Layout.of_one(remembered)
-        self.smooth_layout = Layout.of_one(smooth_part(remembered))
-        self.y_layout = Layout.of_one(ends.start.y)
+        self.lanes = Lanes(min(equations.lanes, self.size), limit)
+        self.solver_state = jtu.tree_map(lambda x: jnp.zeros_like(x[0]), ends.start.solver_state)
+        of = Columns.of_arrays
+        self.each, self.rest, self.starts = of(parts.each), of(parts.rest_each), of(ends.start)
         self.firsts, self.first_bar, self.last_bar = (
-            columns_of_arrays(x) for x in (ends.start.y, ends.first_bar, ends.last_bar)
+            of(x) for x in (ends.start.y, ends.first_bar, ends.last_bar)
         )
         self.common = jtu.tree_map(Value.of_constant, parts.common)
-        self.common_columns = columns_of_values(self.common, self.lanes)  # not in a loop first
-        equations = parts.rest[0]
-        self.max_steps, self.ts = equations.max_steps, equations.saveat.subs.ts
-        rows = jtu.tree_map(lambda x: x.reshape(-1, *x.shape[2:]), ends.values_bar)
-        self.values_bar, self.values_layout = columns_of_arrays(rows), Layout.of_one(rows)
+        common = Columns.of_values(self.common, self.lanes)  # not in a loop first
+        self.no_common = jtu.tree_map(jnp.zeros_like, common)
+        self.values_bar = of(jtu.tree_map(lambda x: x.reshape(-1, *x.shape[2:]), ends.values_bar))
+        self.smooth_layout = Layout.of_one(smooth_part(step_state(ends.start)))
         self.needed = self._needed()
 
     def run(self) -> tuple[Any, Any]:
@@ -67,13 +56,12 @@ class ReverseSweep:
         groups = -(-self.size // count)
         order = jnp.argsort(self.ends.num_steps)
         index = jnp.full(groups * count, self.size).at[: self.size].set(order)
-        start = self._empty_record(), [jnp.zeros_like(x) for x in self.common_columns]
+        start = self._empty_record(), self.no_common
         (_, common), each = lax.scan(self._through_group, start, index.reshape(groups, count))
-        each = [
-            jnp.zeros_like(x, shape=self.size).at[order].set(x.ravel()[: self.size]) for x in each
-        ]
-        total = Layout.of(self.parts.common).arrays([jnp.sum(x, keepdims=True) for x in common])
-        return self.each_layout.arrays(each), jtu.tree_map(lambda x: x[0], total)
+        empty = lambda x: jnp.zeros_like(x, shape=self.size)
+        in_order = lambda x: empty(x).at[order].set(x.ravel()[: self.size])
+        total = jtu.tree_map(lambda x: jnp.sum(x, keepdims=True), common).arrays()
+        return jtu.tree_map(in_order, each).arrays(), jtu.tree_map(lambda x: x[0], total)
 
     def _needed(self) -> Array:
         """Which trajectories anything depends on. The steps of one that failed may have no
@@ -83,174 +71,179 @@ class ReverseSweep:
         return jnp.any(jnp.stack(used), axis=0)
 
     def _empty_record(self) -> Record:
-        time = self.ends.start.tprev.dtype
-        self.record_dtypes = [time, time, *self.step_layout.dtypes_of_columns()]
-        one = stacked([jnp.zeros(self.lanes.count, dtype) for dtype in self.record_dtypes])
-        rows = max(_BYTES // sum(x.nbytes for x in one.values()), 1)
+        start = self.ends.start
+        layout = Layout.of_one((start.tprev, start.tnext, step_state(start)))
+        one = Stacked.of(Columns.zeros(layout, self.lanes.count))
+        rows = max(_BYTES // sum(x.nbytes for x in jtu.tree_leaves(one)), 1)
         self.rows = min(rows, self.max_steps)
-        steps = {k: jnp.zeros((self.rows, *x.shape), x.dtype) for k, x in one.items()}
+        steps = jtu.tree_map(lambda x: jnp.zeros((self.rows, *x.shape), x.dtype), one)
         return Record(steps, jnp.zeros((self.rows, self.lanes.count), bool))
 
-    def _through_group(self, carry: Any, index: Array) -> tuple[Any, list[Array]]:
+    def _through_group(self, carry: Any, index: Array) -> tuple[Any, Columns]:
         record, common = carry
         present, index = index < self.size, jnp.minimum(index, self.size - 1)
-        with self.lanes.inside(self.starts[0][index]):
-            each, rest = taken(self.each, index), taken(self.rest, index)
-            group = Group(index, present & self.needed[index], each, rest, {})
+        with self.lanes.inside(self.starts.columns[0][index]):
+            each, rest = taken((self.each, self.rest), index)
+            group = Group(index, present & self.needed[index], each, rest, None)
             group, bars = self._through_values(group, common)
             bars, record = self._through_segments(group, bars, record)
-            first = taken(self.first_bar, index)
-            y_bar = [x + y for x, y in zip(bars.state, first, strict=False)]
-            bar = self.smooth_layout.values(y_bar + bars.state[len(first) :])
-            through = self._call(self.functions.through_start, group, bar)
+            first_bar = self._state_bar(taken(self.first_bar, index))
+            bar = jtu.tree_map(jnp.add, bars.state, first_bar)
+            *through, _ = self._transposed(begin, group, None, bar.values())
             bars = self._including(bars, group.present, *through)
             return (record, bars.common), bars.each
 
-    def _through_values(self, group: Group, common: list[Array]) -> tuple[Group, Bars]:
-        """What is returned at `ts`, time by time, to begin with."""
-        index, last = group.index, taken(self.last_bar, group.index)
-        zeros = [jnp.zeros(index.size, d) for d in self.smooth_layout.dtypes_of_columns()]
-        none = [jnp.zeros_like(x) for x in group.each]
-        rows = self.ends.rows[index]
-        bars = Bars([*last, *zeros[len(last) :]], none, common, rows - 1)
-        if self.ts is None:
-            return group, bars
-        first, dtypes = taken(self.firsts, index), self.y_layout.dtypes_of_columns()
+    def _state_bar(self, y_bar: Columns) -> Columns:
+        """The cotangent of what a step depends on, from that of the state."""
+        zeros = Columns.zeros(self.smooth_layout, self.lanes.count)
+        columns = [*y_bar.columns, *zeros.columns[len(y_bar.columns) :]]
+        return Columns(columns, self.smooth_layout)
 
-        def at_time(bars: Bars, row: Array) -> tuple[Bars, dict[str, Array]]:
+    def _through_values(self, group: Group, common: Columns) -> tuple[Group, Bars]:
+        """What is returned at `ts`, time by time, to begin with."""
+        index, none = group.index, jtu.tree_map(jnp.zeros_like, group.each)
+        rows = self.ends.rows[index]
+        last_bar = self._state_bar(taken(self.last_bar, index))
+        bars = Bars(last_bar, none, common, rows - 1)
+        states = self.ends.states
+        if states is None:
+            return group, bars
+        first = taken(self.firsts, index)
+
+        def at_time(bars: Bars, row: Array) -> tuple[Bars, Stacked]:
             place, reached = index * self.ts.size + row, row < rows
-            with self.lanes.inside(first[0]):
-                y = where(reached, read(self.ends.states, place, dtypes), first)
-                bar = self.values_layout.values(taken(self.values_bar, place))
-                t = Layout.of(self.ts[0]).values([jnp.broadcast_to(self.ts[row], reached.shape)])
-                *through, y_bar = self._call(
-                    self.functions.through_handed_out, group, t, self.y_layout.values(y), bar
-                )
+            with self.lanes.inside(first.columns[0]):
+                y = where(reached, read(states, place), first).values()
+                bar = taken(self.values_bar, place).values()
+                t = Value.of_column(jnp.broadcast_to(self.ts[row], reached.shape))
+                *through, y_bar = self._transposed(save, group, y, bar, t)
                 bars = self._including(bars, group.present & reached, *through)
-                return bars, stacked(columns_of_values(y_bar, self.lanes))
+                return bars, Stacked.of(Columns.of_values(y_bar, self.lanes))
 
         bars, at_times = lax.scan(at_time, bars, jnp.arange(self.ts.size))
         return group._replace(at_times=at_times), bars
 
     def _through_segments(self, group: Group, bars: Bars, record: Record) -> tuple[Bars, Record]:
         """Go forwards to the last segment, storing where each begins, and back."""
-        state, dtypes = taken(self.starts, group.index), self.state_layout.dtypes_of_columns()
         segments = -(-self.max_steps // self.rows)
         room = lambda x: jnp.zeros((segments, *x.shape), x.dtype).at[0].set(x)
-        firsts = {k: room(x) for k, x in stacked(state).items()}
+        firsts = jtu.tree_map(room, Stacked.of(taken(self.starts, group.index)))
 
         def through_segment(carry: Any) -> Any:
             k, onwards, firsts, record, bars = carry
             with self.lanes.inside():
-                state = unstacked({d: x[k] for d, x in firsts.items()}, dtypes)
+                state = taken(firsts, k).columns()
                 num_rows, unfinished, state, record = self._forwards(group, state, record)
                 onwards = onwards & unfinished
-                bars = self._backwards(group, jnp.where(onwards, 0, num_rows), record, bars)
-                after = stacked(state)  # is not read again in the reverse sweep
-                firsts = {d: x.at[k + 1].set(after[d], mode="drop") for d, x in firsts.items()}
+                num_rows = jnp.where(onwards, 0, num_rows)
+                through = lambda bars, step: self._through_step(group, step, bars)
+                bars = rows_backwards(record, num_rows, through, bars)
+                write = lambda x, new: x.at[k + 1].set(new, mode="drop")
+                # The last one is not read again in the reverse sweep.
+                firsts = jtu.tree_map(write, firsts, Stacked.of(state))
                 return jnp.where(onwards, k + 1, k - 1), onwards, firsts, record, bars
 
         start = jnp.asarray(0), jnp.asarray(True), firsts, record, bars
         *_, record, bars = lax.while_loop(lambda carry: carry[0] >= 0, through_segment, start)
         return bars, record
 
-    def _forwards(self, group: Group, state: list[Array], record: Record) -> tuple[Any, ...]:
+    def _forwards(self, group: Group, state: Columns, record: Record) -> tuple[Any, ...]:
         """The steps of a segment, which are recorded; whether some lane goes on behind it."""
 
-        def goes_on(state: list[Array]) -> Array:
-            trajectory = self.state_layout.values(state)
-            goes_on = self._call(self.functions.goes_on, group, trajectory)
-            return self._column(goes_on) & group.present
+        def goes_on(state: Columns) -> Array:
+            return self._column(Equations.goes_on, group, state.values()) & group.present
 
-        def step(carry: Any) -> Any:
+        def onwards(carry: Any) -> Any:
             row, active, state, record = carry
-            with self.lanes.inside(state[0]):
-                before = self.state_layout.values(state)
-                tried = self._call(self.functions.attempt, group, before)
-                x = columns_of_values((before.tprev, before.tnext, step_state(before)), self.lanes)
-                accepted = active & self._column(tried.kept)
-                record = record.with_row(row, x, accepted)
-                state = where(active, columns_of_values(tried.trajectory, self.lanes), state)
+            with self.lanes.inside(state.columns[0]):
+                before = state.values()
+                tried = self._of_one(Equations.attempt, group, before)
+                made = before.tprev, before.tnext, step_state(before)
+                steps = Stacked.of(Columns.of_values(made, self.lanes))
+                new = Record(steps, active & tried.kept.columns(self.lanes)[0])
+                record = jtu.tree_map(lambda x, new: x.at[row].set(new), record, new)
+                after = Columns.of_values(tried.trajectory, self.lanes)
+                state = where(active, after, state)
                 return row + 1, goes_on(state), state, record
 
         with self.lanes.inside():
             start = jnp.asarray(0), goes_on(state), state, record
         unfinished = lambda carry: (carry[0] < self.rows) & jnp.any(carry[1])
-        row, active, state, record = lax.while_loop(unfinished, step, start)
+        row, active, state, record = lax.while_loop(unfinished, onwards, start)
         return row, jnp.any(active), state, record
 
-    def _backwards(self, group: Group, num_rows: Array, record: Record, bars: Bars) -> Bars:
-        # Fetched one step ahead: XLA would copy the slices into every kernel that needs them.
-        fetched = lambda row: jtu.tree_map(lambda x: x[jnp.maximum(row, 0)], record)
+    def _through_step(self, group: Group, step: Record, bars: Bars) -> Bars:
+        columns = step.steps.columns()
+        with self.lanes.inside(columns.columns[0]):
+            dense_info, pullback = self._call(self._step, group, *columns.values())
+            bars, dense_bar = self._through_rows(group, step.accepted, columns, dense_info, bars)
+            transpose = lambda pullback, *bar: pullback(bar)
+            bar = bars.state.values(), dense_bar
+            *through, state_bar = call_in_lanes(self.lanes, transpose, pullback, *bar)
+            state_bar = Columns.of_values(state_bar, self.lanes)
+            bars = self._including(bars, step.accepted, *through)
+            return bars._replace(state=where(step.accepted, state_bar, bars.state))
 
-        def back(carry: Any) -> Any:
-            row, step, bars = carry
-            columns = unstacked(step.steps, self.record_dtypes)
-            with self.lanes.inside(columns[0]):
-                bars = self._through_step(group, step.accepted, columns, bars)
-            return row - 1, fetched(row - 1), bars
-
-        start = num_rows - 1, fetched(num_rows - 1), bars
-        return lax.while_loop(lambda carry: carry[0] >= 0, back, start)[-1]
-
-    def _through_step(
-        self, group: Group, accepted: Array, columns: list[Array], bars: Bars
-    ) -> Bars:
-        layout = Layout.of(self.ends.start.tprev[0])
-        start, end = (layout.values([x]) for x in columns[:2])
-        state = self.step_layout.values(columns[2:])
-        dense_info, pullback = self._call(self.functions.step, group, start, end, state)
-        if self.ts is None:
-            zero = lambda value: Value.of_constant(jnp.zeros(value.shape, value.dtype))
-            dense_bar = jtu.tree_map(zero, dense_info)
-        else:
-            bars, dense_bar = self._through_rows(group, accepted, columns[:2], dense_info, bars)
-        bar = self.smooth_layout.values(bars.state), dense_bar
-        transpose = lambda pullback, bar: pullback(bar)
-        *through, state_bar = call_in_lanes(self.lanes, transpose, pullback, bar)
-        state_bar = columns_of_values(state_bar, self.lanes)
-        bars = self._including(bars, accepted, *through)
-        return bars._replace(state=where(accepted, state_bar, bars.state))
+    def _step(self, given: Any, start: Any, end: Any, state: State) -> tuple[Any, Callable]:
+        """The data of the interpolation in a step, and what takes cotangents of the smooth part of
+        the state behind it and of these data to those of `each`, `common` and `state`."""
+        each, common, rest = given
+        smooth, discrete = eqx.partition(state, eqx.is_inexact_array)
+        value = self.parts.smooth(step, rest, discrete, self.solver_state, start, end)
+        _, pullback, dense_info = jax.vjp(value, each, common, smooth, has_aux=True)
+        return dense_info, pullback
 
     def _through_rows(
-        self, group: Group, accepted: Array, ends: list[Array], dense_info: Any, bars: Bars
+        self, group: Group, accepted: Array, step: Columns, dense_info: Any, bars: Bars
     ) -> tuple[Bars, Any]:
-        """The values saved in a step."""
-        info, layout = columns_of_values(dense_info, self.lanes), Layout.of(dense_info)
-        time = Layout.of(self.ends.start.tprev[0])
-        direction = self._column(self._call(self.functions.direction, group))
-        at = lambda row: self.ts.astype(ends[0].dtype)[jnp.maximum(row, 0)] * direction
-        due = lambda row: accepted & (row >= 0) & (at(row) > ends[0])
-        lane, dtypes = jnp.arange(group.index.size), self.y_layout.dtypes_of_columns()
+        """The values saved in a step, and the cotangent of the data of its interpolation."""
+        if group.at_times is None:
+            zero = lambda value: Value.of_constant(jnp.zeros(value.shape, value.dtype))
+            return bars, jtu.tree_map(zero, dense_info)
+        info, (start, end) = Columns.of_values(dense_info, self.lanes), step.columns[:2]
+        direction = self._column(lambda equations, given: given.direction, group)
+        at = lambda row: self.ts.astype(start.dtype)[jnp.maximum(row, 0)] * direction
+        due = lambda row: accepted & (row >= 0) & (at(row) > start)
+        lane = jnp.arange(group.index.size)
 
         def through_row(carry: Any) -> Any:
             row, info_bar = carry
             here, place = due(row), jnp.maximum(row, 0)
             with self.lanes.inside():
-                bar = unstacked({d: x[place, :, lane].T for d, x in group.at_times.items()}, dtypes)
-                more = self._call(
-                    self.functions.through_interpolated,
-                    group,
-                    *(time.values([x]) for x in (at(row), *ends)),
-                    layout.values(info),
-                    self.y_layout.values(bar),
-                )
-                more = columns_of_values(more, self.lanes)
+                bar = jtu.tree_map(lambda x: x[place, :, lane].T, group.at_times).columns().values()
+                times = map(Value.of_column, (at(row), start, end))
+                *_, more = self._transposed(interpolate, group, info.values(), bar, *times)
+                more = Columns.of_values(more, self.lanes)
                 return row - here.astype(row.dtype), added(info_bar, more, here)
 
-        start = bars.row, [jnp.zeros_like(x) for x in info]
-        row, bar = lax.while_loop(lambda c: jnp.any(due(c[0])), through_row, start)
-        return bars._replace(row=row), layout.values(bar)
+        none = jtu.tree_map(jnp.zeros_like, info)
+        row, bar = lax.while_loop(lambda c: jnp.any(due(c[0])), through_row, (bars.row, none))
+        return bars._replace(row=row), bar.values()
 
-    def _including(self, bars: Bars, active: Array, each: Any, common: Any) -> Bars:
-        each, common = (columns_of_values(x, self.lanes) for x in (each, common))
-        return bars._replace(
-            each=added(bars.each, each, active), common=added(bars.common, common, active)
-        )
+    def _including(self, bars: Bars, active: Array, *more: Any) -> Bars:
+        each, common = (Columns.of_values(x, self.lanes) for x in more)
+        each, common = added((bars.each, bars.common), (each, common), active)
+        return bars._replace(each=each, common=common)
 
     def _call(self, function: Callable, group: Group, *args: Any) -> Any:
-        each, rest = self.each_layout.values(group.each), self.rest_layout.values(group.rest)
-        return call_in_lanes(self.lanes, function, each, self.common, rest, *args)
+        given = group.each.values(), self.common, group.rest.values()
+        return call_in_lanes(self.lanes, function, given, *args)
 
-    def _column(self, value: Any) -> Array:
-        return columns_of_values(value, self.lanes)[0]
+    def _of_one(self, function: Callable, group: Group, *args: Any) -> Any:
+        """`function(equations, given, *args)`."""
+        call = lambda given, *args: function(*self.parts.one(*given), *args)
+        return self._call(call, group, *args)
+
+    def _column(self, function: Callable, group: Group, *args: Any) -> Array:
+        return self._of_one(function, group, *args).columns(self.lanes)[0]
+
+    def _transposed(self, function: Callable, group: Group, x: Any, bar: Any, *args: Any) -> Any:
+        """Cotangents of `each`, `common` and `x`, from that of what a function returns (see
+        `functions.py`)."""
+
+        def transposed(given: Any, x: Any, bar: Any, *args: Any) -> Any:
+            each, common, rest = given
+            value = self.parts.smooth(function, rest, *args)
+            return jax.vjp(value, each, common, x, has_aux=True)[1](bar)
+
+        return self._call(transposed, group, x, bar, *args)

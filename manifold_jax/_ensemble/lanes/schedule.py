@@ -1,5 +1,6 @@
 """Many trajectories in a few lanes: a lane whose trajectory has ended takes the next one."""
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -10,16 +11,8 @@ from jaxtyping import Array
 
 from ..._jaxpr.lane_arrays import Lanes
 from ..._jaxpr.lane_interpreter import call_in_lanes
-from .columns import (
-    columns_of_arrays,
-    columns_of_values,
-    empty_table,
-    Layout,
-    read,
-    taken,
-    where,
-    written,
-)
+from ..._jaxpr.lane_value import Columns, Layout, Value, where
+from .columns import empty_table, read, Stacked, taken, unknown, written
 from .trajectory import Start
 
 
@@ -28,23 +21,21 @@ _STEPS = 8
 
 
 class Lane(NamedTuple):
-    """Columns of all lanes: which trajectory each has, its own data and state, and the next time to
-    save at."""
+    """All lanes: which trajectory each has, its own data and state, and the next time to save at."""
 
     number: Array
-    given: list[Array]
-    state: list[Array]
+    given: Columns
+    state: Columns
     row: Array
 
 
 class Totals(NamedTuple):
-    """What is known of all trajectories: columns of the outcomes so far, how many times to save at
-    were reached, and
-    the table of states there; the next trajectory to take, and how many have ended."""
+    """What is known of all trajectories: the outcomes so far, how many times to save at were
+    reached, and the table of states there; the next trajectory to take, and how many have ended."""
 
-    outcomes: list[Array]
+    outcomes: Columns
     rows: Array
-    states: dict[str, Array]
+    states: Stacked | None
     next: Array
     ended: Array
 
@@ -57,7 +48,7 @@ class Run(NamedTuple):
     start: Any  # `Start` and `Outcome`, or what the equations have in their place
     outcome: Any
     rows: Array
-    states: dict[str, Array]
+    states: Stacked | None
     values: Any
     failed: Array
 
@@ -67,26 +58,26 @@ class Schedule:
     its own, the trajectories in front of every array; `complete` makes of that of one what the
     methods are given."""
 
-    def __init__(self, equations: Any, given: Any, complete: Any, lanes: int, limit: int):
+    def __init__(self, equations: Any, given: Any, complete: Any, limit: int):
         self.equations, self.complete = equations, complete
         self.size = jtu.tree_leaves(given)[0].shape[0]
-        self.count = min(lanes, self.size)
+        self.count = min(equations.lanes, self.size)
         self.lanes = Lanes(self.count, limit)
-        self.given = columns_of_arrays(given)
-        self.given_layout = Layout.of_one(given)
+        self.given = Columns.of_arrays(given)
         self.ts = equations.saveat.subs.ts
 
     def run(self) -> Run:
-        starts, corrections, state_layout = self._starts()
+        flat = lambda x: x.reshape(-1)[: self.size]
+        starts, corrections = jtu.tree_map(flat, self._of_all(self._begin))
         first = jnp.arange(self.count)
-        row = jnp.zeros(self.count, int)
-        lane = Lane(first, taken(self.given, first), taken(starts, first), row)
-        outcome_layout, y_layout = self._layouts(state_layout)
-        unknown = empty_table(outcome_layout, self.size)
+        given, state = taken((self.given, starts), first)
+        lane = Lane(first, given, state, jnp.zeros(self.count, int))
+        outcome_layout, y_layout = self._layouts(starts.layout)
+        empty = [jnp.full(self.size, unknown(d), d) for d in outcome_layout.dtypes_of_columns()]
         totals = Totals(
-            read(unknown, jnp.arange(self.size), outcome_layout.dtypes_of_columns()),
+            Columns(empty, outcome_layout),
             jnp.zeros(self.size, int),
-            {} if self.ts is None else empty_table(y_layout, self.size * self.ts.size),
+            None if self.ts is None else empty_table(y_layout, self.size * self.ts.size),
             jnp.asarray(self.count),
             jnp.asarray(0),
         )
@@ -94,166 +85,126 @@ class Schedule:
         def advance(carry: tuple[Lane, Totals]) -> tuple[Lane, Totals]:
             with self.lanes.inside():
                 lane, totals = carry
-                step = lambda carry, _: (self._step(carry[0], carry[1], state_layout), None)
+                step = lambda carry, _: (self._step(*carry), None)
                 (lane, states), _ = lax.scan(step, (lane, totals.states), None, length=_STEPS)
-                return self._refill(lane, totals._replace(states=states), starts, state_layout)
+                return self._refill(lane, totals._replace(states=states), starts)
 
         _, totals = lax.while_loop(lambda c: c[1].ended < self.size, advance, (lane, totals))
-        start = Start(state_layout.arrays(starts), corrections)
+        start = Start(starts.arrays(), corrections.arrays())
         values, failed = None, jnp.zeros(self.size, bool)
-        if self.ts is not None:
-            firsts = columns_of_arrays(self.equations.state_of(start.trajectory))
-            values, failed = self._handed_out(totals, firsts, y_layout)
-        outcome = outcome_layout.arrays(totals.outcomes)
-        return Run(start, outcome, totals.rows, totals.states, values, failed)
+        if totals.states is not None:
+            firsts = Columns.of_arrays(self.equations.state_of(start.trajectory))
+            values, failed = self._handed_out(totals.rows, totals.states, firsts)
+        return Run(start, totals.outcomes.arrays(), totals.rows, totals.states, values, failed)
 
-    def _call(self, function: Any, given: list[Array], *args: Any) -> Any:
-        of_each = self.given_layout.values(given)
+    def _call(self, function: Any, given: Columns, *args: Any) -> Any:
         call = lambda of_each, *args: function(self.complete(of_each), *args)
-        return call_in_lanes(self.lanes, call, of_each, *args)
+        return call_in_lanes(self.lanes, call, given.values(), *args)
 
-    def _starts(self) -> tuple[list[Array], Array, Layout]:
-        """Columns of the first states of all trajectories."""
-        layout = None
+    def _column(self, value: Value) -> Array:
+        return value.columns(self.lanes)[0]
 
-        def begin(index: Array) -> tuple[list[Array], list[Array]]:
-            nonlocal layout
-            given = taken(self.given, index)
-            with self.lanes.inside(given[0]):
-                start = self._call(self.equations.begin, given)
-                layout = Layout.of(start.trajectory)
-                columns = columns_of_values(start.trajectory, self.lanes)
-                return columns, columns_of_values(start.correction, self.lanes)
-
+    def _of_all(self, function: Callable) -> Any:
+        """`function(index)` for all trajectories, as many of them at a time as there are lanes."""
         pieces = -(-self.size // self.count)
         index = jnp.minimum(jnp.arange(pieces * self.count), self.size - 1)
-        starts, (correction,) = lax.map(begin, index.reshape(pieces, self.count))
-        flat = lambda x: x.reshape(-1)[: self.size]
-        return [flat(x) for x in starts], flat(correction), layout  # pyright: ignore[reportReturnType]
+        return lax.map(function, index.reshape(pieces, self.count))
+
+    def _begin(self, index: Array) -> list[Columns]:
+        given = taken(self.given, index)
+        with self.lanes.inside(given.columns[0]):
+            start = self._call(self.equations.begin, given)
+            return [Columns.of_values(x, self.lanes) for x in start]
 
     def _layouts(self, state_layout: Layout) -> tuple[Layout, Layout]:
         """Return the layouts of outcomes and of states."""
-        given, trajectory = self.given_layout.example(), state_layout.example()
+        given, trajectory = self.given.layout.example(), state_layout.example()
         outcome = lambda given, trajectory: self.equations.outcome(self.complete(given), trajectory)
         outcomes = Layout.of(jax.eval_shape(outcome, given, trajectory))
         return outcomes, Layout.of(self.equations.state_of(trajectory))
 
-    def _layout_of_values(self, y_layout: Layout) -> Layout:
-        value = lambda given, t, y: self.equations.saved_value(self.complete(given), t, y)[0]
-        given, y = self.given_layout.example(), y_layout.example()
-        return Layout.of(jax.eval_shape(value, given, self.ts[0], y))
-
-    def _handed_out(
-        self, totals: Totals, firsts: list[Array], y_layout: Layout
-    ) -> tuple[Any, Array]:
+    def _handed_out(self, rows: Array, states: Stacked, firsts: Columns) -> tuple[Any, Array]:
         """What is saved of the states, time by time; lanes go together."""
-        times, layout = self.ts.size, self._layout_of_values(y_layout)
+        times = self.ts.size
 
-        def of_lanes(index: Array) -> tuple[Array, list[Array]]:
-            given, first, rows = taken(self.given, index), taken(firsts, index), totals.rows[index]
+        def of_lanes(index: Array) -> tuple[Array, Columns]:
+            given, first, num_rows = taken((self.given, firsts, rows), index)
 
-            def at_time(failed: Array, row: Array) -> tuple[Array, list[Array]]:
-                reached = row < rows
-                with self.lanes.inside(first[0]):
-                    y = read(totals.states, index * times + row, y_layout.dtypes_of_columns())
-                    y = y_layout.values(where(reached, y, first))
-                    t = Layout.of(self.ts[0]).values(
-                        [jnp.broadcast_to(self.ts[row], reached.shape)]
-                    )
+            def at_time(failed: Array, row: Array) -> tuple[Array, Columns]:
+                reached = row < num_rows
+                with self.lanes.inside(first.columns[0]):
+                    y = where(reached, read(states, index * times + row), first).values()
+                    t = Value.of_column(jnp.broadcast_to(self.ts[row], reached.shape))
                     value, success = self._call(self.equations.saved_value, given, t, y)
-                    failed |= reached & ~_column(success, self.lanes)
-                    return failed, columns_of_values(value, self.lanes)
+                    failed |= reached & ~self._column(success)
+                    return failed, Columns.of_values(value, self.lanes)
 
-            failed, columns = lax.scan(at_time, jnp.zeros(index.shape, bool), jnp.arange(times))
-            unreached = jnp.arange(times)[:, None] >= rows[None]
-            return failed, [_without(x, unreached) for x in columns]
+            failed, values = lax.scan(at_time, jnp.zeros(index.shape, bool), jnp.arange(times))
+            unreached = jnp.arange(times)[:, None] >= num_rows[None]
+            without = lambda x: jnp.where(unreached, jnp.asarray(unknown(x.dtype), x.dtype), x)
+            return failed, jtu.tree_map(without, values)
 
-        pieces = -(-self.size // self.count)
-        index = jnp.minimum(jnp.arange(pieces * self.count), self.size - 1)
-        failed, columns = lax.map(of_lanes, index.reshape(pieces, self.count))
+        failed, values = self._of_all(of_lanes)
         by_trajectory = lambda x: jnp.swapaxes(x, 1, 2).reshape(-1, times)[: self.size].ravel()
-        values = layout.arrays([by_trajectory(x) for x in columns])
+        values = jtu.tree_map(by_trajectory, values).arrays()
         values = jtu.tree_map(lambda x: x.reshape(self.size, times, *x.shape[1:]), values)
         return values, failed.ravel()[: self.size]
 
-    def _step(
-        self, lane: Lane, states: dict[str, Array], layout: Layout
-    ) -> tuple[Lane, dict[str, Array]]:
-        with self.lanes.inside(lane.state[0]):
-            state = layout.values(lane.state)
+    def _step(self, lane: Lane, states: Stacked | None) -> tuple[Lane, Stacked | None]:
+        with self.lanes.inside(lane.state.columns[0]):
 
             def attempt(given: Any, trajectory: Any) -> tuple[Any, Any]:
                 goes_on = self.equations.goes_on(given, trajectory)
                 return goes_on, self.equations.attempt(given, trajectory)
 
-            goes_on, tried = self._call(attempt, lane.given, state)
-            active = _column(goes_on, self.lanes) & (lane.number < self.size)
-            after = columns_of_values(tried.trajectory, self.lanes)
-            if self.ts is not None:
+            goes_on, tried = self._call(attempt, lane.given, lane.state.values())
+            active = self._column(goes_on) & (lane.number < self.size)
+            after = Columns.of_values(tried.trajectory, self.lanes)
+            if states is not None:
                 lane, states = self._save(lane, states, tried, active)
             return lane._replace(state=where(active, after, lane.state)), states
 
-    def _save(
-        self, lane: Lane, states: dict[str, Array], tried: Any, active: Array
-    ) -> tuple[Lane, dict[str, Array]]:
+    def _save(self, lane: Lane, states: Stacked, tried: Any, active: Array) -> tuple[Lane, Stacked]:
         """States at the times in this step. What takes long, their correction, is left for later: here it
         would be done for all lanes whenever one of them has something to save."""
-        kept = active & _column(tried.kept, self.lanes)
-        end, start = _column(tried.end, self.lanes), _column(tried.start, self.lanes)
-        info_layout = Layout.of(tried.dense_info)
-        info = columns_of_values(tried.dense_info, self.lanes)
-        direction = _column(self._call(lambda given: given.direction, lane.given), self.lanes)
-        rows, time = self.ts.size, Layout.of(tried.end)
+        kept = active & self._column(tried.kept)
+        end, start = self._column(tried.end), self._column(tried.start)
+        info = Columns.of_values(tried.dense_info, self.lanes)
+        direction = self._column(self._call(lambda given: given.direction, lane.given))
+        rows = self.ts.size
         at = lambda row: self.ts[jnp.minimum(row, rows - 1)] * direction
         due = lambda row: kept & (row < rows) & (at(row) <= end)
 
-        def save(carry: Any) -> Any:
+        def save(carry: tuple[Array, Stacked]) -> tuple[Array, Stacked]:
             row, states = carry
             here = due(row)
             with self.lanes.inside():
-                times = (time.values([x]) for x in (at(row), start, end))
+                times = map(Value.of_column, (at(row), start, end))
                 interpolated = self.equations.interpolated
-                y = call_in_lanes(self.lanes, interpolated, *times, info_layout.values(info))
-                columns = columns_of_values(y, self.lanes)
+                y = call_in_lanes(self.lanes, interpolated, *times, info.values())
+                y = Columns.of_values(y, self.lanes)
             place = jnp.where(here, lane.number * rows + row, self.size * rows)
-            return row + here.astype(row.dtype), written(states, place, columns)
+            return row + here.astype(row.dtype), written(states, place, y)
 
         row, states = lax.while_loop(lambda c: jnp.any(due(c[0])), save, (lane.row, states))
         return lane._replace(row=row), states
 
-    def _refill(
-        self, lane: Lane, totals: Totals, starts: list[Array], layout: Layout
-    ) -> tuple[Lane, Totals]:
-        state = layout.values(lane.state)
-        goes_on = _column(self._call(self.equations.goes_on, lane.given, state), self.lanes)
+    def _refill(self, lane: Lane, totals: Totals, starts: Columns) -> tuple[Lane, Totals]:
+        state = lane.state.values()
+        goes_on = self._column(self._call(self.equations.goes_on, lane.given, state))
         ended = ~goes_on & (lane.number < self.size)
         outcome = self._call(self.equations.outcome, lane.given, state)
         place = jnp.where(ended, lane.number, self.size)
-        outcomes = [
-            o.at[place].set(x, mode="drop")
-            for o, x in zip(totals.outcomes, columns_of_values(outcome, self.lanes), strict=True)
-        ]
-        rows = totals.rows.at[place].set(lane.row, mode="drop")
+        write = lambda total, x: total.at[place].set(x, mode="drop")
+        outcomes = jtu.tree_map(write, totals.outcomes, Columns.of_values(outcome, self.lanes))
+        rows = write(totals.rows, lane.row)
         number = jnp.where(ended, totals.next + jnp.cumsum(ended) - 1, lane.number)
         number = jnp.minimum(number, self.size)
         fresh = ended & (number < self.size)
-        index = jnp.where(fresh, number, 0)
-        lane = Lane(
-            number,
-            where(fresh, taken(self.given, index), lane.given),
-            where(fresh, taken(starts, index), lane.state),
-            jnp.where(fresh, 0, lane.row),
-        )
+        following = taken((self.given, starts), jnp.where(fresh, number, 0))
+        given, state = where(fresh, following, (lane.given, lane.state))
+        lane = Lane(number, given, state, jnp.where(fresh, 0, lane.row))
         count = jnp.sum(ended)
         return lane, Totals(
             outcomes, rows, totals.states, totals.next + count, totals.ended + count
         )
-
-
-def _column(value: Any, lanes: Lanes) -> Array:
-    return columns_of_values(value, lanes)[0]
-
-
-def _without(x: Array, unreached: Array) -> Array:
-    unknown = jnp.inf if jnp.issubdtype(x.dtype, jnp.floating) else 0
-    return jnp.where(unreached, jnp.asarray(unknown, x.dtype), x)

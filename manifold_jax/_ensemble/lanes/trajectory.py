@@ -11,12 +11,14 @@ import equinox as eqx
 import jax.numpy as jnp
 import jax.tree_util as jtu
 from diffrax import RESULTS
+from jax import lax
+from jaxtyping import Array
 
 from ..._base.compat import directed, is_okay, nonlinear_failure, update_result
 from ..._base.rejection import result_of_state
-from ..._base.types import BoolScalar, FloatScalar, IntScalar, RealScalarLike, Y
-from ..._solve.prepare import prepare, Ready
-from ..._solve.setup import Consistent, Given, Setup
+from ..._base.types import Args, BoolScalar, FloatScalar, IntScalar, RealScalarLike, Y
+from ..._solve.prepare import prepare
+from ..._solve.setup import Consistent, ProblemData, Setup
 from ..._solve.times import is_time_missing
 from ..._solver.step.advance import HookState, StepStatistics
 
@@ -32,6 +34,20 @@ class Trajectory(NamedTuple):
     result: RESULTS
     num_steps: IntScalar
     num_accepted: IntScalar
+
+
+class Given(NamedTuple):
+    """What a trajectory is defined by, besides what all have in common."""
+
+    t0: FloatScalar
+    t1: FloatScalar
+    y0: Y
+    args: Args
+    end_floor: FloatScalar  # see [`end_floor`][]
+
+    @property
+    def direction(self) -> FloatScalar:
+        return jnp.where(self.t0 < self.t1, 1, -1).astype(self.t0.dtype)
 
 
 class Start(NamedTuple):
@@ -70,13 +86,18 @@ class Equations(eqx.Module):
     dt0: RealScalarLike | None
     adjoint: dfx.AbstractAdjoint
     max_steps: int = eqx.field(static=True)
+    lanes: int = eqx.field(static=True)  # how many trajectories advance together
     consistent: Consistent = eqx.field(static=True)
 
     def begin(self, given: Given) -> Start:
-        solver, args, ready = self.solver, given.args, self._ready(given)
-        terms, direction = self._directed(given)
-        y0 = ready.given.y0
-        t0, t1 = ready.given.t0 * direction, ready.given.t1 * direction
+        solver, args = self.solver, given.args
+        settings = self.dt0, self.saveat, self.controller, self.consistent
+        data = ProblemData(given.t0, given.t1, given.y0, args)
+        ready = prepare(Setup(self.terms, solver, *settings, throw=False), data)
+        direction = given.direction
+        terms = directed(self.terms, direction)
+        t0, t1, y0, _ = ready.data
+        t0, t1 = t0 * direction, t1 * direction
         dt0 = None if ready.dt0 is None else ready.dt0 * direction
         error_order = solver.error_order(terms)
         tnext, controller_state = self.controller.wrap(direction).init(
@@ -94,37 +115,27 @@ class Equations(eqx.Module):
         trajectory = Trajectory(t0, tnext, y0, solver_state, controller_state, result, zero, zero)
         return Start(trajectory, ready.start.correction)
 
-    def _ready(self, given: Given) -> Ready:
-        setup = self.terms, self.solver, self.dt0, self.saveat, self.controller, self.consistent
-        return prepare(Setup(*setup, throw=False), given)
-
     def goes_on(self, given: Given, trajectory: Trajectory) -> BoolScalar:
         before = trajectory.tprev < given.t1 * given.direction
-        return before & self._successful(trajectory) & (trajectory.num_steps < self.max_steps)
+        return before & is_okay(trajectory.result) & (trajectory.num_steps < self.max_steps)
 
     def attempt(self, given: Given, trajectory: Trajectory) -> Attempt:
-        terms, direction = self._directed(given)
-        t1, solver = given.t1 * direction, self.solver
+        solver, direction = self.solver, given.direction
+        terms, t1 = directed(self.terms, direction), given.t1 * direction
         before, end = trajectory, trajectory.tnext
         y, error, dense_info, solver_state, solver_result = solver.step(
             terms, before.tprev, end, before.y, given.args, before.solver_state, False
         )
         error = jtu.tree_map(lambda x: jnp.where(jnp.isnan(x), jnp.inf, x), error)
-        kept, tprev, tnext, _, controller_state, result = self.controller.wrap(
-            direction
-        ).adapt_step_size(
-            before.tprev,
-            end,
-            before.y,
-            y,
-            given.args,
-            error,
-            solver.error_order(terms),
-            before.controller_state,
+        controller, of_step = self.controller.wrap(direction), (before.tprev, end, before.y, y)
+        kept, tprev, tnext, _, controller_state, result = controller.adapt_step_size(
+            *of_step, given.args, error, solver.error_order(terms), before.controller_state
         )
         kept = jnp.asarray(kept)
         tprev = jnp.minimum(tprev, t1)
-        tnext = _clipped(tprev, tnext, t1, kept)  # pyright: ignore[reportArgumentType]
+        # A step that ends just short of the end would leave one of a few rounding errors.
+        last = jnp.where(kept, t1, tprev + 0.5 * (t1 - tprev))
+        tnext = jnp.where(tnext > given.end_floor, last, tnext)
         keep = lambda a, b: jnp.where(kept, a, b)
         result = update_result(RESULTS.where(kept, solver_result, RESULTS.successful), result)
         after = Trajectory(
@@ -159,30 +170,20 @@ class Equations(eqx.Module):
 
     def outcome(self, given: Given, trajectory: Trajectory) -> Outcome:
         result = trajectory.result
-        unfinished = (trajectory.tprev < given.t1 * given.direction) & self._successful(trajectory)
+        unfinished = (trajectory.tprev < given.t1 * given.direction) & is_okay(result)
         result = RESULTS.where(unfinished, RESULTS.max_steps_reached, result)
         result = update_result(result, trajectory.solver_state.result)
         t = trajectory.tprev * given.direction
-        return Outcome(
-            t,
-            trajectory.y,
-            result,
-            trajectory.num_steps,
-            trajectory.num_accepted,
-            trajectory.solver_state.statistics,
-        )
-
-    def _successful(self, trajectory: Trajectory) -> BoolScalar:
-        return is_okay(trajectory.result)
-
-    def _directed(self, given: Given) -> tuple[Any, FloatScalar]:
-        return directed(self.terms, given.direction), given.direction
+        counts = trajectory.num_steps, trajectory.num_accepted
+        return Outcome(t, trajectory.y, result, *counts, trajectory.solver_state.statistics)
 
 
-def _clipped(
-    tprev: FloatScalar, tnext: FloatScalar, t1: FloatScalar, kept: BoolScalar
-) -> FloatScalar:
-    """Not just short of the end, where a step of a few rounding errors would be left."""
-    floor = t1 - 50 * jnp.finfo(t1.dtype).eps * jnp.abs(t1)
-    end = jnp.where(kept, t1, tprev + 0.5 * (t1 - tprev))
-    return jnp.where(tnext > floor, end, tnext)
+def end_floor(t0: Array, t1: Array) -> Array:
+    """The hundredth number below `t1`, where time increases: steps that would end beyond it end at
+    `t1`, as in `diffrax.diffeqsolve`. Numbers are counted as the integers of their bits."""
+    end = lax.stop_gradient(jnp.where(t0 < t1, t1, -t1))
+    tiny = jnp.finfo(end.dtype).tiny  # smaller numbers are zero to XLA
+    first = jnp.where(end == 0, -tiny, jnp.nextafter(end, -jnp.inf))
+    bits = lax.bitcast_convert_type(first, f"int{8 * end.dtype.itemsize}")
+    bits = jnp.where(first > 0, bits - 99, bits + 99)
+    return lax.bitcast_convert_type(bits, end.dtype)

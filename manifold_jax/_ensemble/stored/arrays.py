@@ -133,6 +133,6 @@ def clear_write_errors(path: Path) -> Iterator[None]:
         reason = error.strerror or str(error)
         raise OSError(
             error.errno,
-            f"cannot write to `out={str(path)!r}`: {reason}. The chunks that are finished are kept; go on with "
+            f"cannot write to `path={str(path)!r}`: {reason}. The chunks that are finished are kept; go on with "
             "`resume=True` once that is repaired.",
         ) from error

@@ -1,7 +1,6 @@
 """What is missing or damaged of a stored ensemble."""
 
 import json
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,8 +13,7 @@ _MOST = 5
 
 class Fault(NamedTuple):
     """A fault of one file: its name in the folder, what is wrong, and the number of the chunk it
-    has, `None`
-    for a description."""
+    has, `None` for a description."""
 
     file: str
     what: str
@@ -45,8 +43,7 @@ def described(path: Path) -> dict[str, Any] | None:
 
 def faults_of_descriptions(path: Path, attributes: dict[str, Any]) -> list[Fault]:
     """Return the faults of the files `zarr.json` of groups and arrays, without which theirs cannot
-    be read. Before the
-    first chunk they are still being written."""
+    be read. Before the first chunk they are still being written."""
     out = []
     for name, fingerprint in attributes["files"].items():
         description, fault = _read(path, name)
@@ -60,8 +57,7 @@ def faults_of_descriptions(path: Path, attributes: dict[str, Any]) -> list[Fault
 
 def faults_of_chunks(group: Any) -> list[Fault]:
     """Return the faults of those chunks that have been computed, each of which is read. The last
-    may be unfinished: `result`
-    is its last array."""
+    may be unfinished: `result` is its last array."""
     root, arrays = group.store.root, _arrays(group)
     there = {name: _chunks_there(root, name, array) for name, array in arrays.items()}
     begun = max((max(chunks, default=-1) for chunks in there.values()), default=-1)
@@ -85,30 +81,25 @@ def finished_chunks(group: Any) -> list[int]:
 
 
 def in_words(faults: list[Fault], chunk: int) -> str:
-    words = [_with_trajectories(fault, chunk) for fault in faults[:_MOST]]
+    def words(fault: Fault) -> str:
+        if fault.chunk is None:
+            return str(fault)
+        start = fault.chunk * chunk
+        return f"{fault} (trajectories from {start} to {start + chunk - 1})"
+
     more = f", and {len(faults) - _MOST} files more" if len(faults) > _MOST else ""
-    return ", ".join(words) + more
-
-
-def _with_trajectories(fault: Fault, chunk: int) -> str:
-    if fault.chunk is None:
-        return str(fault)
-    start = fault.chunk * chunk
-    return f"{fault} (trajectories from {start} to {start + chunk - 1})"
+    return ", ".join(map(words, faults[:_MOST])) + more
 
 
 def _read(path: Path, name: str) -> tuple[dict[str, Any] | None, Fault | None]:
     """A file of JSON, or what is wrong with it."""
+    file = path / name
     try:
-        text = (path / name).read_text(encoding="utf-8")
+        description = json.loads(file.read_text(encoding="utf-8"))
     except (FileNotFoundError, NotADirectoryError):
         return None, Fault(name, "missing")
-    except UnicodeDecodeError:
-        return None, Fault(name, "damaged")
-    try:
-        description = json.loads(text)
-    except ValueError:
-        return None, Fault(name, "damaged" if text else "empty")
+    except ValueError:  # no text, or no JSON
+        return None, Fault(name, "damaged" if file.stat().st_size else "empty")
     if not isinstance(description, dict):
         return None, Fault(name, "damaged")
     return description, None
@@ -126,15 +117,10 @@ def _arrays(group: Any) -> dict[str, Any]:
 
 
 def _chunks_there(root: Path, name: str, array: Any) -> set[int]:
-    return set(_numbers(root, name, array))
-
-
-def _numbers(root: Path, name: str, array: Any) -> Iterator[int]:
     folder = root / name / "c"
-    if folder.is_dir():
-        for entry in folder.iterdir():
-            if entry.name.isdecimal() and (root / _file_of(name, array, int(entry.name))).is_file():
-                yield int(entry.name)
+    names = [entry.name for entry in folder.iterdir()] if folder.is_dir() else []
+    numbers = {int(name) for name in names if name.isdecimal()}
+    return {k for k in numbers if (root / _file_of(name, array, k)).is_file()}
 
 
 def _file_of(name: str, array: Any, k: int) -> str:

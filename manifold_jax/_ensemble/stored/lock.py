@@ -80,6 +80,6 @@ def _is_taken(out: Path, file: IO) -> str:
     file.seek(0)
     who = file.read() or "another process"
     return (
-        f"`out={str(out)!r}` is being written by {who}. Wait until that has ended, or end it, and go on with "
+        f"`path={str(out)!r}` is being written by {who}. Wait until that has ended, or end it, and go on with "
         "`resume=True`; or take another folder."
     )

@@ -37,21 +37,10 @@ class StoredEnsemble:
     def __init__(self, group: Any):
         self.group = group
 
-    @property
-    def ts(self) -> Any:
-        return self.group["ts"]
-
-    @property
-    def ys(self) -> Any:
-        return self.group["ys"]
-
-    @property
-    def stats(self) -> Any:
-        return self.group["stats"]
-
-    @property
-    def result(self) -> Any:
-        return self.group["result"]
+    ts = property(lambda self: self.group["ts"])
+    ys = property(lambda self: self.group["ys"])
+    stats = property(lambda self: self.group["stats"])
+    result = property(lambda self: self.group["result"])
 
     @property
     def settings(self) -> dict[str, Any]:
