@@ -14,10 +14,9 @@ import manifold_jax as mj
 from manifold_jax._applications.following import kernel
 from manifold_jax._base.closure import convert_closure
 from manifold_jax._base.derivative_rule import ForwardRule
-from manifold_jax._dae.pivots import Pivoted
-from manifold_jax._linalg.dense import Elimination, factorize, factorize_once, pseudo_invert
+from manifold_jax._linalg.dense import factorize, factorize_once, pseudo_invert
 from manifold_jax._linalg.newton import root_of_step
-from manifold_jax._linalg.pivoted import factorize_pivoted
+from manifold_jax._linalg.pivoted import Elimination, factorize_equilibrated, factorize_pivoted
 from manifold_jax._solver.step.explicit import derivative_once
 
 
@@ -105,8 +104,8 @@ RULES = {
     "of the library": solved(factorize, 10),
     "inverse": solved(factorize_once, 4),
     "elimination with exchanges": solved(Elimination, 4),
-    "pivoted, few": solved(Pivoted.of, 3),
-    "pivoted, many": solved(Pivoted.of, 10),
+    "pivoted, few": solved(factorize_equilibrated, 3),
+    "pivoted, many": solved(factorize_equilibrated, 10),
     "stages of Rosenbrock methods": solved(factorize_pivoted, 3),
     "pseudo-inverse": pseudo_inverse,
     "derivative_once": lambda a: total(derivative_once(vector(a, 3) ** 2, vector(a, 3))),

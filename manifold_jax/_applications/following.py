@@ -14,8 +14,8 @@ from .._constraint.constraint import Constraint
 from .._constraint.project import consistent_state
 from .._constraint.projection_info import ProjectionInfo
 from .._constraint.residual import jacobian
-from .._linalg.dense import Elimination, reduction
 from .._linalg.newton import without_derivative
+from .._linalg.pivoted import Elimination, reduction
 from .._solve import diffeqsolve
 from .._solver import Projected
 

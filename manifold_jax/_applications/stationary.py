@@ -10,8 +10,9 @@ from jaxtyping import Array, Float
 
 from .._base.types import Args, BoolScalar, FloatScalar
 from .._constraint.residual import jacobian, row_scale
-from .._linalg.dense import Elimination, Factorization, factorize, gram
+from .._linalg.dense import Factorization, factorize, gram
 from .._linalg.newton import AbstractEquations, find_root, implicit_root, without_derivative
+from .._linalg.pivoted import Elimination
 
 
 class Lagrangian(eqx.Module):

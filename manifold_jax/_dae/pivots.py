@@ -2,15 +2,13 @@
 
 from typing import Any, Literal, NamedTuple
 
-import equinox as eqx
-import jax
 import jax.numpy as jnp
-import jax.scipy.linalg as jsl
 import numpy as np
 from jaxtyping import Array, Float
 
 from .._base.types import BoolScalar
-from .._linalg.dense import Factorization, factorize, gram, reduction, UNROLL_LIMIT
+from .._linalg.dense import Factorization, factorize, gram, UNROLL_LIMIT
+from .._linalg.pivoted import factorize_equilibrated
 from .._linalg.rows import multiply
 from .compressed import Compressed
 from .derivatives import pick
@@ -47,12 +45,10 @@ class Elimination(NamedTuple):
         """Large ones are factored by the library, which exchanges rows in any case."""
         return self.sign != 0 and len(self.other_rows) <= UNROLL_LIMIT
 
-    def factorize(self, S: Float[Array, "k k"]) -> "Factorization | Pivoted":
-        return factorize(self.sign * S) if self.is_definite else Pivoted.of(S)  # pyright: ignore[reportReturnType]
+    def factorize(self, S: Float[Array, "k k"]) -> Factorization:
+        return factorize(self.sign * S) if self.is_definite else factorize_equilibrated(S)  # pyright: ignore[reportReturnType]
 
-    def solve_rest(
-        self, rest: "Factorization | Pivoted", b: Float[Array, " k"]
-    ) -> Float[Array, " k"]:
+    def solve_rest(self, rest: Factorization, b: Float[Array, " k"]) -> Float[Array, " k"]:
         return rest.solve(self.sign * b if self.is_definite else b)
 
 
@@ -89,7 +85,7 @@ class Eliminated(NamedTuple):
     pivots: Float[Array, " p"]
     right: Float[Array, "p k"]
     below: Float[Array, "k p"]
-    rest: "Factorization | Pivoted | None"
+    rest: Factorization | None
 
     @staticmethod
     def of(plan: Elimination, entries: Compressed, derivatives: Array) -> "Eliminated":
@@ -121,45 +117,3 @@ class Eliminated(NamedTuple):
         y = plan.solve_rest(self.rest, lower)
         x = (upper - multiply(self.right, y)) / self.pivots
         return pick(jnp.concatenate([x, y]), order)
-
-
-class Pivoted(eqx.Module):
-    """Any square matrix, equilibrated and factored with row exchanges, and whether its rank was
-    full. The derivative is that of `A x = b`."""
-
-    A: Float[Array, "k k"]
-    scales: tuple[Array, Array]  # of rows and columns, held fixed
-    factors: Any
-    full_rank: BoolScalar
-
-    @staticmethod
-    def of(A: Float[Array, "k k"]) -> "Pivoted":
-        k, fixed = A.shape[0], jax.lax.stop_gradient(A)
-        one = lambda size: jnp.where(size > 0, 1 / jnp.where(size > 0, size, 1), 1)
-        rows = one(jnp.max(jnp.abs(fixed), axis=1))
-        columns = one(jnp.max(jnp.abs(fixed) * rows[:, None], axis=0))
-        scaled = fixed * rows[:, None] * columns[None, :]
-        threshold = 10 * k * float(jnp.finfo(A.dtype).eps)
-        if k <= UNROLL_LIMIT:
-            factors = reduction(scaled)[0]
-            full_rank = jnp.max(jnp.abs(factors)) * threshold < 1  # not so of NaN
-        else:
-            factors = jsl.lu_factor(scaled)
-            full_rank = jnp.all(jnp.abs(jnp.diagonal(factors[0])) > threshold)
-        return Pivoted(A, (rows, columns), factors, full_rank)
-
-    def solve(self, b: Float[Array, " k"]) -> Float[Array, " k"]:
-        A, (rows, columns), factors = self.A, self.scales, self.factors
-
-        def solve(transposed: bool, b: Array) -> Array:
-            left, right = (columns, rows) if transposed else (rows, columns)
-            if isinstance(factors, tuple):
-                return right * jsl.lu_solve(factors, left * b, trans=int(transposed))
-            return right * multiply(factors.T if transposed else factors, left * b)
-
-        return jax.lax.custom_linear_solve(
-            lambda x: multiply(A, x),
-            b,
-            lambda _, b: solve(False, b),
-            lambda _, b: solve(True, b),
-        )

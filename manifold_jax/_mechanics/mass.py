@@ -1,5 +1,6 @@
 """The mass matrix in its forms (scalar, diagonal, blocks, matrix), factored once per evaluation."""
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any
 
@@ -11,7 +12,7 @@ import jax.tree_util as jtu
 from jaxtyping import Array, Float
 
 from .._base.types import Args, BoolScalar, RealScalarLike, Y
-from .._linalg.dense import Factorization, factorize, gram, UNROLL_LIMIT
+from .._linalg.dense import Factorization, factorize, gram, rank_threshold, UNROLL_LIMIT
 from .._linalg.rows import InverseWeights, Rows
 from .._linalg.sparse import SparseRows
 
@@ -202,9 +203,8 @@ def _masses(M: Float[Array, "n n"]) -> Float[Array, " n"]:
 def _factorize_positive(M: Float[Array, "n n"]) -> Factorization:
     if M.shape[0] <= UNROLL_LIMIT:
         return factorize(M)  # which wants positive pivots  # pyright: ignore[reportReturnType]
-    threshold = 10 * M.shape[0] * float(jnp.finfo(M.dtype).eps)
     size = jnp.sqrt(jnp.maximum(jnp.abs(jnp.diagonal(M)), jnp.finfo(M.dtype).tiny))
     lower = jnp.linalg.cholesky(jax.lax.stop_gradient(M / size[:, None] / size[None, :]))
-    positive = jnp.all(jnp.diagonal(lower) ** 2 > threshold)  # NaN unless positive definite
+    positive = jnp.all(jnp.diagonal(lower) ** 2 > rank_threshold(M))  # NaN unless positive definite
     factorization = factorize(jnp.where(positive, M, jnp.eye(M.shape[0], dtype=M.dtype)))
-    return Factorization(factorization.A, factorization.lu, positive)  # pyright: ignore[reportAttributeAccessIssue]
+    return dataclasses.replace(factorization, full_rank=positive)  # pyright: ignore[reportReturnType]
