@@ -64,8 +64,9 @@ class AbstractRosenbrock(dfx.AbstractAdaptiveSolver):
     linear system, all with the matrix `M / gamma - h df/dy`, which is factored once per step."""
 
     tableau: eqx.AbstractClassVar[RosenbrockTableau]
-    checks_start: eqx.AbstractVar[bool]  # not where the state has been made consistent before
-    largest_written_out: eqx.AbstractVar[int]  # number of rows that LAPACK does not factor
+    checks_start: bool = True  # not where the state has been made consistent before
+    # Number of rows up to which LAPACK does not factor.
+    largest_written_out: int = eqx.field(default=LARGEST_WRITTEN_OUT, static=True)
 
     term_structure: ClassVar = dfx.AbstractTerm
     interpolation_cls: ClassVar[Callable[..., RosenbrockInterpolation]] = RosenbrockInterpolation
@@ -156,8 +157,6 @@ class Rodas5P(AbstractRosenbrock):
     """
 
     tableau: ClassVar[RosenbrockTableau] = RODAS5P
-    checks_start: bool = True
-    largest_written_out: int = eqx.field(default=LARGEST_WRITTEN_OUT, static=True)
 
 
 class Rodas3P(AbstractRosenbrock):
@@ -172,8 +171,6 @@ class Rodas3P(AbstractRosenbrock):
     """
 
     tableau: ClassVar[RosenbrockTableau] = RODAS3P
-    checks_start: bool = True
-    largest_written_out: int = eqx.field(default=LARGEST_WRITTEN_OUT, static=True)
 
 
 def _check_terms(terms: Any) -> None:
