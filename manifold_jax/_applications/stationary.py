@@ -38,7 +38,7 @@ class Lagrangian(eqx.Module):
     def normals(self, x: Float[Array, " n"]) -> tuple[Float[Array, "m n"], Factorization]:
         """`G = dg/dx` and the factors of `G G^T`."""
         _, G = jacobian(self.g, x)
-        return G, factorize(gram(G, G))  # pyright: ignore[reportReturnType]
+        return G, factorize(gram(G, G))
 
     def projected_gradient(
         self, x: Float[Array, " n"]

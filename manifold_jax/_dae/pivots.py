@@ -46,7 +46,7 @@ class Elimination(NamedTuple):
         return self.sign != 0 and len(self.other_rows) <= UNROLL_LIMIT
 
     def factorize(self, S: Float[Array, "k k"]) -> Factorization:
-        return factorize(self.sign * S) if self.is_definite else factorize_equilibrated(S)  # pyright: ignore[reportReturnType]
+        return factorize(self.sign * S) if self.is_definite else factorize_equilibrated(S)
 
     def solve_rest(self, rest: Factorization, b: Float[Array, " k"]) -> Float[Array, " k"]:
         return rest.solve(self.sign * b if self.is_definite else b)

@@ -107,7 +107,7 @@ _SMALLEST_INVERSE = 3
 def factorize_once(A: Float[Array, "m m"]) -> "Factorization | Inverse":
     """Factor a matrix, for what is evaluated once in a step, or in a solve."""
     if not _SMALLEST_INVERSE <= A.shape[0] <= UNROLL_LIMIT:
-        return factorize(A)  # pyright: ignore[reportReturnType]
+        return factorize(A)
     return Inverse(*_invert(A))
 
 
@@ -160,8 +160,8 @@ class PseudoInverse(eqx.Module):
         return self.inverse @ b
 
 
-def factorize(A: Float[Array, "m m"], redundant: bool = False) -> Factorization | PseudoInverse:
-    """Factor `A`, symmetric positive semidefinite if `redundant`.
+def factorize(A: Float[Array, "m m"]) -> Factorization:
+    """Factor a regular matrix.
 
     Small ones without pivoting: the matrices met here are `G V` with `V` close to `W^-1 G^T`, or mass
     matrices, hence close to symmetric positive definite.
@@ -170,8 +170,6 @@ def factorize(A: Float[Array, "m m"], redundant: bool = False) -> Factorization 
     Gram matrix `A = G W^-1 G^T` that ratio is the squared sine of the angle between
     one row of `G` and the span of those before it, and rounding leaves about `eps` of it.
     """
-    if redundant:
-        return pseudo_invert(A, equilibrated=True)
     m, fixed = A.shape[0], jax.lax.stop_gradient(A)
     if m > UNROLL_LIMIT:
         return _factorize_with_library(A)

@@ -45,12 +45,10 @@ class Factored(NamedTuple):
         return f - combine(multipliers, self.directions), multipliers
 
 
-def solve_held_fixed(
-    M: Any, C: Float[Array, "m n"], factored: Factored, force: Float[Array, " n"], r: Any
-) -> Pair:
+def solve_held_fixed(M: Any, factored: Factored, force: Float[Array, " n"], r: Any) -> Pair:
     """Accelerations and multipliers, with the derivatives of `M` (as of `mass_values`), `C`, `force`
-    and `r`, but not of what was `factored`."""
-    factored = jax.lax.stop_gradient(factored)
+    and `r`, but not of what was factored."""
+    C, factored = factored.C, jax.lax.stop_gradient(factored)
     if isinstance(M, InvertedBlocks):  # with M^-1 p in the place of a, as M is not known
         momenta = lambda p, z: (p + combine(z, C), multiply(C, M.solve(p)))
         p, multipliers = _solve_linear(

@@ -22,6 +22,13 @@ from .motion import LagrangianForce, Motion
 from .stabilization import Baumgarte, VelocityStabilization
 
 
+_old_names = refuse_old_names(
+    constraint="position_constraint",
+    further="auxiliary",
+    further_constraint="auxiliary_constraint",
+)
+
+
 class MechanicalSystem(eqx.Module):
     r"""A mechanical system with constraints, `n` coordinates and `m` constraints:
 
@@ -94,11 +101,7 @@ class MechanicalSystem(eqx.Module):
     redundant: bool = eqx.field(static=True)
     structure: Choice = eqx.field(static=True)
 
-    @refuse_old_names(
-        constraint="position_constraint",
-        further="auxiliary",
-        further_constraint="auxiliary_constraint",
-    )
+    @_old_names
     def __init__(
         self,
         mass_matrix: Any,
@@ -129,11 +132,7 @@ class MechanicalSystem(eqx.Module):
         self.structure = structure
 
     @classmethod
-    @refuse_old_names(
-        constraint="position_constraint",
-        further="auxiliary",
-        further_constraint="auxiliary_constraint",
-    )
+    @_old_names
     def from_lagrangian(
         cls,
         lagrangian: Callable,
@@ -217,12 +216,8 @@ class MechanicalSystem(eqx.Module):
         assert isinstance(self.stabilization, Baumgarte)
         motion = Motion(self, t, y, args)
         alpha, beta = self.stabilization.alpha, self.stabilization.beta
-        rate = motion.equations.velocity(motion.t, motion.w, (motion.x, args))
-        p = motion.num_positions
-        stiffness = motion.bias.at[:p].add(
-            beta**2 * motion.equations.position(motion.t, motion.x, args)
-        )
-        a, _ = motion.solve(stiffness)
+        rate, p = motion.here.velocities(), motion.num_positions
+        a, _ = motion.solve(motion.bias.at[:p].add(beta**2 * motion.here.positions()))
         damping = motion.constrained(alpha * rate.at[:p].multiply(2))
         still = jax.tree_util.tree_map(jnp.zeros_like, y)
         field = y[1], motion.unravel(a), *self._auxiliary_rates(t, y, args)
