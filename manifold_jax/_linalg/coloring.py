@@ -2,15 +2,13 @@
 Applics 13 (1974) 117-119)."""
 
 import itertools
+from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
-from jaxtyping import Bool
 
 
-def greedy_colors(
-    conflict: Bool[np.ndarray, "n n"] | sp.csr_array, most_conflicts_first: bool = False
-) -> np.ndarray:
+def greedy_colors(conflict: Any, most_conflicts_first: bool = False) -> np.ndarray:
     """The smallest color for each number that those in conflict with it do not have yet."""
     conflict = sp.csr_array(conflict + conflict.T)
     starts = conflict.indptr

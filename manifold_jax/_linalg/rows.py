@@ -1,13 +1,20 @@
 """Rows of a matrix: an array, or products with them alone."""
 
 import abc
-from typing import Any, TYPE_CHECKING, TypeAlias
+from typing import Any, Protocol, runtime_checkable, TYPE_CHECKING, TypeAlias
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .dense import gram, UNROLL_LIMIT
+
+
+@runtime_checkable
+class Metric(Protocol):
+    """A symmetric matrix `W` that can be solved with."""
+
+    def solve(self, rows: Float[Array, "*k n"]) -> Float[Array, "*k n"]: ...
 
 
 class AbstractRows(eqx.Module):
@@ -24,6 +31,10 @@ class AbstractRows(eqx.Module):
     @abc.abstractmethod
     def sizes(self, scale: Float[Array, " n"]) -> Float[Array, " m"]:
         """`max_j |C_ij| scale_j` with positive scales."""
+
+    @abc.abstractmethod
+    def along(self, metric: Metric) -> "AbstractRows":
+        """`C W^-1`."""
 
     @abc.abstractmethod
     def factorize(self, directions: "AbstractRows", checked: bool = True) -> Any:
@@ -48,6 +59,11 @@ if TYPE_CHECKING:
     Rows: TypeAlias = Any  # whoever knows that they are an array uses them as one
 else:
     Rows: TypeAlias = Float[Array, "_ _"] | AbstractRows
+
+
+def directions_of(metric: Metric, C: Rows) -> Rows:
+    """The rows of `V^T = C W^-1`."""
+    return C.along(metric) if isinstance(C, AbstractRows) else metric.solve(C)
 
 
 def combine(weights: Float[Array, " m"], rows: Rows) -> Float[Array, " n"]:

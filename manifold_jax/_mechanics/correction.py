@@ -27,10 +27,9 @@ from .._constraint.correction import (
     solve_correction,
 )
 from .._constraint.settings import NewtonProjection
-from .._linalg.rows import InverseWeights
+from .._linalg.rows import directions_of, InverseWeights
 from .._linalg.sparse import SparseRows
 from .kinematics import flat, Kinematics
-from .mass import directions_of
 
 
 class InverseMetrics(NamedTuple):
@@ -111,8 +110,8 @@ class TwoStages(NamedTuple):
         J = self.here.at(x, x).position_rows(C, p)
         if metrics is not None:  # one for positions of its own
             return ConstraintNormals(J, directions_of(InverseWeights(metrics.positions), J))
-        if isinstance(J, SparseRows):
-            return ConstraintNormals(J, J.along(directions.metric))
+        if isinstance(directions, SparseRows):  # `J` may have too few rows for that
+            return ConstraintNormals(J, directions_of(directions.metric, J))  # pyright: ignore[reportArgumentType]
         return ConstraintNormals(J, directions[:p])
 
     def _solve(self, residual, x, args, safe, factored: FactoredGram, far: bool) -> CorrectionRoot:

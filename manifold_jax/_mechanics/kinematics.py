@@ -73,7 +73,7 @@ class Kinematics(NamedTuple):
             return rate
         return jnp.concatenate([rate, self._nonholonomic(t, w, context)])
 
-    def _nonholonomic(self, t: Array, w: Vector, context: tuple[Vector, Args]) -> Vector:
+    def _nonholonomic(self, t: Array, w: Vector, context: tuple[Vector, Args]) -> Array:
         x, args = context
         assert self.nonholonomic is not None
         return jfu.ravel_pytree(self.nonholonomic(t, self.unravel(x), self.unravel(w), args))[0]

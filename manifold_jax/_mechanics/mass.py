@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 from .._base.shapes import shapes
 from .._base.types import Args, BoolScalar, RealScalarLike, Y
 from .._linalg.dense import Factorization, factorize, gram, rank_threshold, UNROLL_LIMIT
-from .._linalg.rows import InverseWeights, Rows
+from .._linalg.rows import Rows
 from .._linalg.sparse import SparseRows
 
 
@@ -90,11 +90,6 @@ class InvertedBlocks(eqx.Module):
         parts = rows.reshape(*rows.shape[:-1], number, 1, size)
         inverse = self.inverse.reshape(*(1,) * (rows.ndim - 1), number, size, size)
         return jnp.sum(inverse * parts, axis=-1).reshape(rows.shape)
-
-
-def directions_of(metric: "Mass | InvertedBlocks | InverseWeights", C: Rows) -> Rows:
-    """The rows of `V^T = C W^-1`."""
-    return C.along(metric) if isinstance(C, SparseRows) else metric.solve(C)
 
 
 def mass_values(mass_matrix: Any, q: Y) -> Float[Array, "..."] | InvertedBlocks:

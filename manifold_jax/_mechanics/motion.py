@@ -20,10 +20,9 @@ from .._linalg.dense import (
     PseudoInverse,
     UNROLL_LIMIT,
 )
-from .._linalg.rows import AbstractRows, combine, multiply
+from .._linalg.rows import AbstractRows, combine, directions_of, multiply
 from .auxiliary import split
 from .kinematics import Kinematics
-from .mass import directions_of
 from .saddle_point import Factored, solve_held_fixed
 
 
