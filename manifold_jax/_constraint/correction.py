@@ -37,7 +37,7 @@ class FactoredGram(NamedTuple):
     """The normals at a point with `G V` factored: the linearization of a correction."""
 
     normals: ConstraintNormals
-    factorization: Any  # Factorization | Inverse | PseudoInverse, or that of sparse rows
+    factorization: Any  # Factorization | Inverse, or that of sparse rows
 
     @staticmethod
     def of(
@@ -49,7 +49,7 @@ class FactoredGram(NamedTuple):
         A = gram(*normals)
         if not redundant:
             return FactoredGram(normals, factorize_once(A))
-        return FactoredGram(normals, pseudo_invert(A, equilibrated=True, dependent=dependent))
+        return FactoredGram(normals, pseudo_invert(A, dependent))
 
     def solve(self, b: Float[Array, " m"]) -> Float[Array, " m"]:
         return self.factorization.solve(b)

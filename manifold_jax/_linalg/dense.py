@@ -89,15 +89,14 @@ class Library(eqx.Module):
 
 
 class Inverse(eqx.Module):
-    """`A^-1` by Gauss-Jordan elimination without pivoting, the whole matrix in one array: fewer and
-    larger operations than those of [`Factorization`][], of which a program is compiled in less
-    time. For what is evaluated once in a step; at stages the elimination is faster."""
+    """The inverse of a matrix, or its pseudo-inverse."""
 
     inverse: Float[Array, "m m"]
     full_rank: BoolScalar
+    product: Callable = eqx.field(static=True)
 
     def solve(self, b: Float[Array, "m ..."]) -> Float[Array, "m ..."]:
-        return _product(self.inverse, b)
+        return self.product(self.inverse, b)
 
 
 # Rows from which on the inverse pays.
@@ -105,10 +104,15 @@ _SMALLEST_INVERSE = 3
 
 
 def factorize_once(A: Float[Array, "m m"]) -> "Factorization | Inverse":
-    """Factor a matrix, for what is evaluated once in a step, or in a solve."""
+    """Factor a matrix, for what is evaluated once in a step, or in a solve.
+
+    Small ones by Gauss-Jordan elimination without pivoting, the whole matrix in one array: fewer and
+    larger operations than those of [`factorize`][], of which a program is compiled in less time. At
+    stages that elimination is faster.
+    """
     if not _SMALLEST_INVERSE <= A.shape[0] <= UNROLL_LIMIT:
         return factorize(A)
-    return Inverse(*_invert(A))
+    return Inverse(*_invert(A), _product)
 
 
 @jax.custom_jvp
@@ -146,20 +150,6 @@ def _product(A: Float[Array, "i j"], B: Float[Array, "j ..."]) -> Float[Array, "
     return jnp.sum(A.reshape(*A.shape, *(1,) * (B.ndim - 1)) * B[None], axis=1)
 
 
-class PseudoInverse(eqx.Module):
-    """`A^+`: for equations that depend on each other the solution of least norm, where the matrix is
-    equilibrated with each unknown multiplied by the square root of its diagonal entry.
-
-    Its derivative is that at constant rank (Golub & Pereyra 1973).
-    """
-
-    inverse: Float[Array, "m m"]
-    full_rank: BoolScalar  # not asked for: only whether the matrix was finite
-
-    def solve(self, b: Float[Array, "m ..."]) -> Float[Array, "m ..."]:
-        return self.inverse @ b
-
-
 def factorize(A: Float[Array, "m m"]) -> Factorization:
     """Factor a regular matrix.
 
@@ -172,7 +162,8 @@ def factorize(A: Float[Array, "m m"]) -> Factorization:
     """
     m, fixed = A.shape[0], jax.lax.stop_gradient(A)
     if m > UNROLL_LIMIT:
-        return _factorize_with_library(A)
+        pivots = jnp.diagonal(jsl.lu_factor(_equilibrated(A))[0])
+        return _factorize_by_library(A, jnp.all(jnp.abs(pivots) > rank_threshold(A)))
     lu = [[fixed[i, j] for j in range(m)] for i in range(m)]
     full_rank = jnp.asarray(True)
     for k in range(m):
@@ -191,21 +182,19 @@ def factorize(A: Float[Array, "m m"]) -> Factorization:
 _DEPENDENT = 1e-4
 
 
-def pseudo_invert(
-    A: Float[Array, "m m"], *, equilibrated: bool = False, dependent: Any = _DEPENDENT
-) -> PseudoInverse:
-    """Return the pseudo-inverse of a symmetric positive semidefinite matrix; `equilibrated` with
-    its diagonal scaled to one, so that the units of equations do not decide which of them depend on
-    others. Eigenvalues below `dependent` times the largest count as zero."""
+def pseudo_invert(A: Float[Array, "m m"], dependent: Any = _DEPENDENT) -> Inverse:
+    """Return `A^+` of a symmetric positive semidefinite matrix with its diagonal scaled to one, so
+    that the units of equations do not decide which of them depend on others: for such equations the
+    solution of least norm, each unknown multiplied by the square root of its diagonal entry.
+    Eigenvalues below `dependent` times the largest count as zero. In the place of a full rank, which
+    is not asked for, it says whether the matrix was finite."""
     finite = jnp.all(jnp.isfinite(A))
     A = jnp.where(finite, A, jnp.eye(A.shape[0], dtype=A.dtype))
-    scale = jnp.ones_like(A)
-    if equilibrated:
-        diagonal = jax.lax.stop_gradient(jnp.diagonal(A))
-        size = jnp.where(diagonal > 0, 1 / jnp.sqrt(jnp.where(diagonal > 0, diagonal, 1)), 1)
-        scale = size[:, None] * size[None, :]
+    diagonal = jax.lax.stop_gradient(jnp.diagonal(A))
+    size = jnp.where(diagonal > 0, 1 / jnp.sqrt(jnp.where(diagonal > 0, diagonal, 1)), 1)
+    scale = size[:, None] * size[None, :]
     dependent = jax.lax.stop_gradient(jnp.asarray(dependent, A.dtype))
-    return PseudoInverse(scale * _pseudo_inverse(scale * A, dependent), finite)
+    return Inverse(scale * _pseudo_inverse(scale * A, dependent), finite, jnp.matmul)
 
 
 @ForwardRule
@@ -226,10 +215,21 @@ def _pseudo_inverse_jvp(P, primals, tangents):
     return turned + turned.T - P @ A_dot @ P
 
 
-def _factorize_with_library(A: Float[Array, "m m"]) -> Factorization:
+def factorize_positive(A: Float[Array, "m m"]) -> Factorization:
+    """Factor a symmetric matrix, whose rank counts as full if it is positive definite."""
+    if A.shape[0] <= UNROLL_LIMIT:
+        return factorize(A)  # which wants positive pivots
+    lower = jnp.linalg.cholesky(_equilibrated(A))
+    positive = jnp.all(jnp.diagonal(lower) ** 2 > rank_threshold(A))  # NaN unless positive definite
+    return _factorize_by_library(A, positive)
+
+
+def _equilibrated(A: Float[Array, "m m"]) -> Float[Array, "m m"]:
     size = jnp.sqrt(jnp.maximum(jnp.abs(jnp.diagonal(A)), jnp.finfo(A.dtype).tiny))
-    equilibrated, _ = jsl.lu_factor(jax.lax.stop_gradient(A / size[:, None] / size[None, :]))
-    full_rank = jnp.all(jnp.abs(jnp.diagonal(equilibrated)) > rank_threshold(A))
+    return jax.lax.stop_gradient(A / size[:, None] / size[None, :])
+
+
+def _factorize_by_library(A: Float[Array, "m m"], full_rank: BoolScalar) -> Factorization:
     A = jnp.where(full_rank, A, jnp.eye(A.shape[0], dtype=A.dtype))
     factors = Library(jsl.lu_factor(jax.lax.stop_gradient(A)))
     return Factorization(A, factors, full_rank, _product)

@@ -1,6 +1,5 @@
 """The mass matrix in its forms (scalar, diagonal, blocks, matrix), factored once per evaluation."""
 
-import dataclasses
 from collections.abc import Callable
 from typing import Any, ClassVar
 
@@ -13,7 +12,7 @@ from jaxtyping import Array, Float
 
 from .._base.shapes import shapes
 from .._base.types import Args, BoolScalar, RealScalarLike, Y
-from .._linalg.dense import Factorization, factorize, gram, rank_threshold, UNROLL_LIMIT
+from .._linalg.dense import Factorization, factorize_positive, gram
 from .._linalg.rows import Rows
 from .._linalg.sparse import SparseRows
 
@@ -135,7 +134,7 @@ def factorize_mass(M: Float[Array, "..."] | InvertedBlocks, C: Rows) -> Mass | I
     if M.ndim == 3:
         return _factorize_blocks(M, C)
     symmetric, weights = _is_symmetric(M), jax.lax.stop_gradient(_weights(M, C))
-    factorization = _factorize_positive(M + gram((C * weights[:, None]).T, C.T))
+    factorization = factorize_positive(M + gram((C * weights[:, None]).T, C.T))
     return Mass(None, factorization, weights, symmetric, factorization.full_rank)
 
 
@@ -156,7 +155,7 @@ def _factorize_blocks(M: Float[Array, "b d d"], C: Rows) -> Mass | InvertedBlock
     symmetric, augmentation = _is_symmetric(M), jnp.zeros((C.structure.num_equations,), M.dtype)
     if C.structure.local.any():
         M, augmentation = _augmented(M, C)
-    factorization = jax.vmap(_factorize_positive)(M)
+    factorization = jax.vmap(factorize_positive)(M)
     return Mass(None, factorization, augmentation, symmetric, jnp.all(factorization.full_rank))
 
 
@@ -190,13 +189,3 @@ def _masses(M: Float[Array, "n n"]) -> Float[Array, " n"]:
     diagonal = jnp.diagonal(M)
     mean, eps = jnp.mean(jnp.abs(diagonal)), jnp.finfo(M.dtype).eps
     return jnp.where(diagonal > 10 * eps * mean, diagonal, mean)
-
-
-def _factorize_positive(M: Float[Array, "n n"]) -> Factorization:
-    if M.shape[0] <= UNROLL_LIMIT:
-        return factorize(M)  # which wants positive pivots
-    size = jnp.sqrt(jnp.maximum(jnp.abs(jnp.diagonal(M)), jnp.finfo(M.dtype).tiny))
-    lower = jnp.linalg.cholesky(jax.lax.stop_gradient(M / size[:, None] / size[None, :]))
-    positive = jnp.all(jnp.diagonal(lower) ** 2 > rank_threshold(M))  # NaN unless positive definite
-    factorization = factorize(jnp.where(positive, M, jnp.eye(M.shape[0], dtype=M.dtype)))
-    return dataclasses.replace(factorization, full_rank=positive)

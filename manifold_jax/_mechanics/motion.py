@@ -17,7 +17,6 @@ from .._linalg.dense import (
     gram,
     gram_written_out,
     pseudo_invert,
-    PseudoInverse,
     UNROLL_LIMIT,
 )
 from .._linalg.rows import AbstractRows, combine, directions_of, multiply
@@ -68,7 +67,7 @@ class Motion:
             self.factorization = self.C.factorize(self.directions, checked=False)
         else:
             gram_matrix = gram_written_out(self.C, self.directions)
-            self.factorization = _factorized(gram_matrix, system.redundant)
+            self.factorization = (pseudo_invert if self.redundant else factorize)(gram_matrix)
 
     def solve(self, bias: Float[Array, " m"]) -> tuple[Float[Array, " n"], Float[Array, " m"]]:
         """Accelerations and multipliers of `M a + C^T lambda = Q`, `C a = -bias`."""
@@ -76,17 +75,14 @@ class Motion:
         if self._is_large() and isinstance(self.factorization, Factorization):
             M = self.here.mass_values()
             factored = Factored(self.C, self.directions, self.mass, self.factorization)
-            accelerations, multipliers = solve_held_fixed(M, factored, force, -bias)
-            undefined = jnp.where(self.mass.valid & self.factorization.full_rank, 0, jnp.nan)
-            undefined = undefined.astype(force.dtype)
-            return accelerations + undefined, multipliers + undefined
+            pair = solve_held_fixed(M, factored, force, -bias)
+            return _defined(*pair, self.mass.valid & self.factorization.full_rank)
         if self.mass.augmentation is not None:
             force = force - combine(self.mass.augmentation * bias, self.C)
         free = self.mass.solve(force)
         right = multiply(self.C, free) + bias
         multipliers = self.factorization.solve(right)
         accelerations = free - combine(multipliers, self.directions)
-        # Added, not selected: the derivative of a discarded NaN would be NaN.
         valid = self.mass.valid & self.factorization.full_rank
         if isinstance(self.C, AbstractRows):
             # `M` applied to the free accelerations and to those by the constraints.
@@ -95,8 +91,7 @@ class Motion:
             valid &= self.factorization.solves(residual, size2)  # pyright: ignore[reportAttributeAccessIssue]
         elif self.redundant:
             valid &= _agree(self.C, accelerations, bias)
-        undefined = jnp.where(valid, 0, jnp.nan).astype(free.dtype)
-        return accelerations + undefined, multipliers + undefined
+        return _defined(accelerations, multipliers, valid)
 
     def _is_large(self) -> bool:
         """Whether the derivative of `C M^-1 C^T` would cost more than what is around it."""
@@ -113,12 +108,16 @@ class Motion:
         if isinstance(J, AbstractRows):
             factorization = J.factorize(directions)
         else:
-            factorization = _factorized(gram(J, directions), self.redundant)
+            factorization = (pseudo_invert if self.redundant else factorize)(gram(J, directions))
         return self.here.w - combine(factorization.solve(rate), directions)
 
 
-def _factorized(A: Float[Array, "m m"], redundant: bool) -> Factorization | PseudoInverse:
-    return pseudo_invert(A, equilibrated=True) if redundant else factorize(A)
+def _defined(
+    a: Float[Array, " n"], multipliers: Float[Array, " m"], valid: BoolScalar
+) -> tuple[Float[Array, " n"], Float[Array, " m"]]:
+    # Added, not selected: the derivative of a discarded NaN would be NaN.
+    undefined = jnp.where(valid, 0, jnp.nan).astype(a.dtype)
+    return a + undefined, multipliers + undefined
 
 
 def _agree(C: Float[Array, "m n"], a: Float[Array, " n"], bias: Float[Array, " m"]) -> BoolScalar:

@@ -64,7 +64,7 @@ def assemble_traced(
 
 
 def _least_norm(J: Float[Array, "m n"], b: Float[Array, " m"]) -> Float[Array, " n"]:
-    return J.T @ pseudo_invert(J @ J.T, equilibrated=True, dependent=_DEPENDENT).solve(b)
+    return J.T @ pseudo_invert(J @ J.T, _DEPENDENT).solve(b)
 
 
 def _raise_unless_small(

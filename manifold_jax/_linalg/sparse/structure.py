@@ -37,7 +37,7 @@ class Structure:
     """
 
     def __init__(self, depends: sp.csr_matrix, per_block: int):
-        self.num_equations, self.num_unknowns = depends.shape  # pyright: ignore[reportGeneralTypeIssues]
+        self.num_equations: int = depends.shape[0]  # pyright: ignore[reportOptionalSubscript]
         self._depends, self._per_block = depends, per_block
         blocks = _merged(depends, per_block)
         coupled = (blocks @ blocks.T).tocoo()
