@@ -17,8 +17,8 @@ from .._base.types import Args, BoolScalar, RealScalarLike, Y
 from .._constraint.projection_info import ProjectionInfo
 from .._constraint.residual import as_time, jacobian, row_scale
 from .._constraint.settings import NewtonProjection
-from .._linalg.dense import Factorization, gram
-from .._linalg.newton import AbstractEquations, find_root, implicit_root, without_derivative
+from .._linalg.dense import gram
+from .._linalg.newton import find_root, implicit_root, SquareSystem, without_derivative
 from .._linalg.pivoted import factorize_equilibrated
 from .equations import leaf_names, listed
 from .highest_derivatives import HighestDerivatives
@@ -162,26 +162,11 @@ def _found(
     return jnp.concatenate([z, w]) if implicit else z, info, regular
 
 
-class _Leading(AbstractEquations):
-    """The closing equations, for `w`."""
-
-    closing: HighestDerivatives
-
-    def point(self, z: Float[Array, " k"]) -> Float[Array, " k"]:
-        return z
-
-    def residual(self, x: Float[Array, " k"]) -> Float[Array, " k"]:
-        return self.closing.residual(x)
-
-    def linearize(self, x: Float[Array, " k"]) -> Factorization:
-        return factorize_equilibrated(self.closing.matrix(x))
-
-
 def _leading(
     closing: HighestDerivatives, guess: Float[Array, " k"]
 ) -> tuple[Float[Array, " k"], BoolScalar]:
     """The derivatives near a guess, and whether they solve the equations."""
-    equations = _Leading(closing)
+    equations = SquareSystem(closing.residual, closing.matrix)
     fixed, tolerance = without_derivative(equations), NewtonProjection().tolerance_for(guess.dtype)
     found = find_root(equations, guess, _MOST_STEPS, tolerance)
     change = fixed.linearize(found).solve(fixed.residual(found))

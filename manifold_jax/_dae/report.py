@@ -97,21 +97,16 @@ class DAEReport:
 
     def _matrix(self) -> list[str]:
         """The signature matrix with the offsets beside and below it."""
-        body = [["." if s < 0 else str(s) for s in row] for row in self.sigma.tolist()]
-        table = [["", *self.unknowns, "c"]]
-        table += [
-            [name, *row, str(c)]
-            for name, row, c in zip(self.equations, body, self.c.tolist(), strict=True)
+        sigma = np.where(self.sigma < 0, ".", self.sigma.astype(str))
+        columns = [
+            [name, *entries, str(d)]
+            for name, entries, d in zip(self.unknowns, sigma.T.tolist(), self.d, strict=True)
         ]
-        table.append(["d", *map(str, self.d.tolist()), ""])
-        widths = [max(map(len, column)) for column in zip(*table, strict=True)]
-        return [
-            "  ".join(
-                cell.ljust(width) if k == 0 else cell.rjust(width)
-                for k, (cell, width) in enumerate(zip(row, widths, strict=True))
-            ).rstrip()
-            for row in table
-        ]
+        columns.append(["c", *map(str, self.c), ""])
+        first = ["", *self.equations, "d"]
+        padded = [[cell.ljust(max(map(len, first))) for cell in first]]
+        padded += [[cell.rjust(max(map(len, column))) for cell in column] for column in columns]
+        return ["  ".join(row).rstrip() for row in zip(*padded, strict=True)]
 
     def _grouped(self) -> str:
         groups: dict[int, list[str]] = {}

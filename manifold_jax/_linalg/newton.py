@@ -43,9 +43,11 @@ class AbstractEquations(eqx.Module):
 
 
 class SquareSystem(AbstractEquations):
-    """`function(z) = 0` of vectors."""
+    """`function(z) = 0` of vectors, with its matrix `dr/dz` if there is a shorter way to it. Both are
+    pytrees of all that they depend on."""
 
-    function: Callable  # a pytree of all that it depends on
+    function: Callable
+    matrix: Callable | None = None
 
     def point(self, z: Float[Array, " m"]) -> Float[Array, " m"]:
         return z
@@ -54,7 +56,8 @@ class SquareSystem(AbstractEquations):
         return self.function(x)
 
     def linearize(self, x: Float[Array, " m"]) -> Factorization:
-        return factorize_equilibrated(jax.jacfwd(self.function)(x))
+        matrix = jax.jacfwd(self.function) if self.matrix is None else self.matrix
+        return factorize_equilibrated(matrix(x))
 
 
 class Iterate(NamedTuple):

@@ -115,9 +115,6 @@ class MechanicalSystem(eqx.Module):
         redundant: bool = False,
         structure: Choice = "auto",
     ):
-        _check_arguments(position_constraint, force, velocity_constraint, stabilization, auxiliary)
-        _check_auxiliary(auxiliary, auxiliary_constraint)
-        check_choice(structure, redundant)
         own = isinstance(mass_matrix, LagrangianMass | ConfigurationMass)  # of another system
         if callable(mass_matrix) and not own:
             check_function("mass_matrix", mass_matrix, "M(q, args)")
@@ -130,6 +127,36 @@ class MechanicalSystem(eqx.Module):
         self.stabilization = stabilization
         self.redundant = redundant
         self.structure = structure
+
+    def __check_init__(self):
+        _check_force(self.force, self.auxiliary)
+        if self.holonomic is not None:
+            check_function("position_constraint", self.holonomic, "phi(t, q, args)")
+        if self.nonholonomic is not None:
+            check_function("velocity_constraint", self.nonholonomic, "a(t, q, v, args)")
+        if self.holonomic is None and self.nonholonomic is None:
+            raise ValueError(
+                "`position_constraint` is None and there is no `velocity_constraint`: without constraints use "
+                "`diffrax.ODETerm` and the solver alone."
+            )
+        if not isinstance(self.stabilization, Baumgarte | VelocityStabilization | None):
+            raise TypeError(
+                "`stabilization` must be `mj.Baumgarte(alpha, beta)` or `mj.VelocityStabilization()`, got "
+                f"{type(self.stabilization).__name__}. Others are arguments of `mj.Stabilized`."
+            )
+        if self.auxiliary is not None:
+            check_function("auxiliary", self.auxiliary, "h(t, q, v, z, args)")
+        elif self.auxiliary_constraint is not None:
+            raise ValueError(
+                "`auxiliary_constraint` is for the states of `auxiliary`, which is None. Constraints on positions and "
+                "velocities are `position_constraint` and `velocity_constraint`."
+            )
+        if not isinstance(self.auxiliary_constraint, AbstractConstraint | None):
+            raise TypeError(
+                "`auxiliary_constraint` must be an `mj.Constraint` on z, or another one, got "
+                f"{type(self.auxiliary_constraint).__name__}. Write e.g. `mj.Constraint(lambda t, z, args: z @ z - 1.0)`."
+            )
+        check_choice(self.structure, self.redundant)
 
     @classmethod
     @_old_names
@@ -224,45 +251,6 @@ class MechanicalSystem(eqx.Module):
         return field, (still[0], motion.unravel(-damping), *still[2:])
 
 
-def _check_arguments(
-    position_constraint: Any,
-    force: Any,
-    velocity_constraint: Any,
-    stabilization: Any,
-    auxiliary: Any,
-) -> None:
-    _check_force(force, auxiliary)
-    if position_constraint is not None:
-        check_function("position_constraint", position_constraint, "phi(t, q, args)")
-    if velocity_constraint is not None:
-        check_function("velocity_constraint", velocity_constraint, "a(t, q, v, args)")
-    if position_constraint is None and velocity_constraint is None:
-        raise ValueError(
-            "`position_constraint` is None and there is no `velocity_constraint`: without constraints use "
-            "`diffrax.ODETerm` and the solver alone."
-        )
-    if not isinstance(stabilization, Baumgarte | VelocityStabilization | None):
-        raise TypeError(
-            "`stabilization` must be `mj.Baumgarte(alpha, beta)` or `mj.VelocityStabilization()`, got "
-            f"{type(stabilization).__name__}. Others are arguments of `mj.Stabilized`."
-        )
-
-
 def _check_force(force: Any, auxiliary: Any) -> None:
     call = "Q(t, q, v, args)" if auxiliary is None else "Q(t, q, v, z, args)"
     check_function("force", force, call)
-
-
-def _check_auxiliary(auxiliary: Any, auxiliary_constraint: Any) -> None:
-    if auxiliary is not None:
-        check_function("auxiliary", auxiliary, "h(t, q, v, z, args)")
-    elif auxiliary_constraint is not None:
-        raise ValueError(
-            "`auxiliary_constraint` is for the states of `auxiliary`, which is None. Constraints on positions and "
-            "velocities are `position_constraint` and `velocity_constraint`."
-        )
-    if not isinstance(auxiliary_constraint, AbstractConstraint | None):
-        raise TypeError(
-            "`auxiliary_constraint` must be an `mj.Constraint` on z, or another one, got "
-            f"{type(auxiliary_constraint).__name__}. Write e.g. `mj.Constraint(lambda t, z, args: z @ z - 1.0)`."
-        )

@@ -11,14 +11,14 @@ import jax.tree_util as jtu
 from diffrax import RESULTS
 from jaxtyping import Array, Float
 
-from .._base.compat import is_okay, is_sde, nonlinear_failure, time_direction, undirected
+from .._base.compat import is_okay, is_sde, nonlinear_failure, undirected
 from .._base.rejection import is_repeatable, rejecting
 from .._base.types import Args, BoolScalar, FloatScalar, RealScalarLike, Y
 from .._constraint.checks import check_state
 from .._linalg.pivoted import LARGEST_WRITTEN_OUT
 from .algebraic import is_consistent
 from .stages import rosenbrock_step
-from .system import mass_matrix_term, System
+from .system import System
 from .tableau import RODAS3P, RODAS5P, RosenbrockTableau
 
 
@@ -83,15 +83,14 @@ class AbstractRosenbrock(dfx.AbstractAdaptiveSolver):
         check_state(y0)
         _check_terms(terms)
         derivative, usable = None, jnp.asarray(True)
-        term = mass_matrix_term(terms)
-        if term is not None:
-            direction = time_direction(terms)
+        system = System.of(terms, t0, t1, y0, args)
+        if system.mass is not None:
             x, _ = jfu.ravel_pytree(y0)
-            start = term.equations(y0, args).at(t0 * direction, x)
+            start, derivative = system.at_start(x)
             if self.checks_start:
                 usable = is_consistent(x, start)
-            if callable(term.mass):
-                derivative = start.derivative * jnp.asarray(direction, x.dtype)
+            if not callable(system.mass.mass):
+                derivative = None
         return RosenbrockState(jnp.abs(jnp.asarray(t1) - t0), derivative, usable)
 
     def step(

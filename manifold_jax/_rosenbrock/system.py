@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 
 from .._base.compat import directed, time_direction, undirected
 from .._base.types import Args, RealScalarLike, Y
+from .algebraic import Linearized
 from .mass_matrix import mass_values, MassMatrixTerm, product, ravelled_like
 
 
@@ -74,17 +75,18 @@ class System(NamedTuple):
         _, T = jax.jvp(lambda t: rest(t, x0)[0], (t0,), (self.step.astype(t0.dtype),))
         return f0, J, T
 
+    def at_start(self, x0: Vector) -> tuple[Linearized, Vector]:
+        """The equations with their mass matrix at the beginning, and `y'` in the direction of the
+        step."""
+        direction = time_direction(self.terms)
+        at = self.mass.equations(self.y0, self.args).at(self.t0 * direction, x0)  # pyright: ignore
+        return at, at.derivative * jnp.asarray(direction, x0.dtype)
+
     def refreshed(self, made_jump: Any, derivative: Vector | None, x0: Vector) -> Vector | None:
         """The carried derivative `y'`, computed anew behind a jump of the field."""
         if derivative is None or made_jump is False:
             return derivative
-        direction = time_direction(self.terms)
-
-        def compute() -> Vector:
-            at = self.mass.equations(self.y0, self.args).at(self.t0 * direction, x0)  # pyright: ignore
-            return at.derivative * jnp.asarray(direction, x0.dtype)
-
-        return jax.lax.cond(made_jump, compute, lambda: derivative)
+        return jax.lax.cond(made_jump, lambda: self.at_start(x0)[1], lambda: derivative)
 
     def _unravel(self, x: Vector) -> Y:
         return jfu.ravel_pytree(self.y0)[1](x)
