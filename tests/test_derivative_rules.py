@@ -16,7 +16,11 @@ from manifold_jax._base.closure import convert_closure
 from manifold_jax._base.derivative_rule import ForwardRule
 from manifold_jax._linalg.dense import factorize, factorize_once, pseudo_invert
 from manifold_jax._linalg.newton import root_of_step
-from manifold_jax._linalg.pivoted import Elimination, factorize_equilibrated, factorize_pivoted
+from manifold_jax._linalg.pivoted import (
+    factorize_by_reduction,
+    factorize_equilibrated,
+    factorize_pivoted,
+)
 from manifold_jax._solver.step.explicit import derivative_once
 
 
@@ -103,7 +107,7 @@ RULES = {
     "elimination without exchanges": solved(factorize, 3),
     "of the library": solved(factorize, 10),
     "inverse": solved(factorize_once, 4),
-    "elimination with exchanges": solved(Elimination, 4),
+    "elimination with exchanges": solved(factorize_by_reduction, 4),
     "pivoted, few": solved(factorize_equilibrated, 3),
     "pivoted, many": solved(factorize_equilibrated, 10),
     "stages of Rosenbrock methods": solved(factorize_pivoted, 3),

@@ -12,7 +12,7 @@ from .._base.types import Args, BoolScalar, FloatScalar
 from .._constraint.residual import jacobian, row_scale
 from .._linalg.dense import Factorization, factorize, gram
 from .._linalg.newton import AbstractEquations, find_root, implicit_root, without_derivative
-from .._linalg.pivoted import Elimination
+from .._linalg.pivoted import factorize_by_reduction
 
 
 class Lagrangian(eqx.Module):
@@ -88,8 +88,8 @@ class _Conditions(AbstractEquations):
     def point(self, z: Float[Array, " n_plus_m"]) -> Float[Array, " n_plus_m"]:
         return z
 
-    def linearize(self, x: Float[Array, " n_plus_m"]) -> Elimination:
-        return Elimination(jax.jacfwd(self.residual)(x))
+    def linearize(self, x: Float[Array, " n_plus_m"]) -> Factorization:
+        return factorize_by_reduction(jax.jacfwd(self.residual)(x))
 
     def residual(self, x: Float[Array, " n_plus_m"]) -> Float[Array, " n_plus_m"]:
         x, multipliers = x[: self.n], x[self.n :]

@@ -19,8 +19,8 @@ _SMALLEST_PIVOT = 1e-6
 
 
 class Elimination(NamedTuple):
-    """Which pivots are taken: `J[rows, columns]` is diagonal and constant. Of what is left the
-    symmetric part may be definite, positive or negative (`sign`), or not (0)."""
+    """Which pivots are taken: `J[rows, columns]` is diagonal and constant. What is left may be
+    symmetric and definite, positive or negative (`sign`), or not (0)."""
 
     rows: np.ndarray
     columns: np.ndarray
@@ -32,24 +32,14 @@ class Elimination(NamedTuple):
     def of(constant: np.ndarray, samples: list[np.ndarray]) -> "Elimination":
         """Choose pivots from samples of the matrix, and where it is constant."""
         rows, columns = _independent_pivots(constant, samples)
-        n = constant.shape[0]
+        n, sign = constant.shape[0], 0
         others = [np.setdiff1d(np.arange(n), taken) for taken in (rows, columns)]
-        left = [_schur_complement(J, rows, columns, *others) for J in samples]
-        for sign in (1, -1):
-            if all(_is_definite(sign * S) for S in left):
-                return Elimination(rows, columns, *others, sign)  # pyright: ignore[reportCallIssue]
-        return Elimination(rows, columns, *others, 0)  # pyright: ignore[reportCallIssue]
-
-    @property
-    def is_definite(self) -> bool:
-        """Large ones are factored by the library, which exchanges rows in any case."""
-        return self.sign != 0 and len(self.other_rows) <= UNROLL_LIMIT
-
-    def factorize(self, S: Float[Array, "k k"]) -> Factorization:
-        return factorize(self.sign * S) if self.is_definite else factorize_equilibrated(S)
-
-    def solve_rest(self, rest: Factorization, b: Float[Array, " k"]) -> Float[Array, " k"]:
-        return rest.solve(self.sign * b if self.is_definite else b)
+        # Large ones are factored by the library, which exchanges rows in any case.
+        if len(others[0]) <= UNROLL_LIMIT:
+            left = [_schur_complement(J, rows, columns, *others) for J in samples]
+            definite = [s for s in (1, -1) if all(_is_definite(s * S) for S in left)]
+            sign = definite[0] if definite else 0
+        return Elimination(rows, columns, *others, sign)  # pyright: ignore[reportCallIssue]
 
 
 def _independent_pivots(
@@ -97,7 +87,8 @@ class Eliminated(NamedTuple):
         S = entries.block(derivatives, plan.other_rows, plan.other_columns)
         if len(plan.rows) > 0:
             S = S - gram(below, (right / pivots[:, None]).T)
-        return Eliminated(plan, pivots, right, below, plan.factorize(S))
+        rest = factorize(plan.sign * S) if plan.sign else factorize_equilibrated(S)
+        return Eliminated(plan, pivots, right, below, rest)
 
     @property
     def full_rank(self) -> BoolScalar:
@@ -110,10 +101,10 @@ class Eliminated(NamedTuple):
         order = np.argsort(np.concatenate([plan.columns, plan.other_columns]))
         if self.rest is None:
             return pick(upper / self.pivots, order)
+        if len(plan.rows) > 0:
+            lower = lower - multiply(self.below, upper / self.pivots)
+        y = self.rest.solve(plan.sign * lower if plan.sign else lower)
         if len(plan.rows) == 0:
-            y = plan.solve_rest(self.rest, lower)
             return pick(y, order)
-        lower = lower - multiply(self.below, upper / self.pivots)
-        y = plan.solve_rest(self.rest, lower)
         x = (upper - multiply(self.right, y)) / self.pivots
         return pick(jnp.concatenate([x, y]), order)

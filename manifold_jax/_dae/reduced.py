@@ -7,10 +7,10 @@ import equinox as eqx
 import jax
 import jax.flatten_util as jfu
 import jax.numpy as jnp
-import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Float
 
+from .._base.shapes import shapes
 from .._base.types import Args, BoolScalar, RealScalarLike, Y
 from .._constraint.checks import check_state
 from .._constraint.constraint import AbstractConstraint
@@ -37,24 +37,17 @@ class Reduced(eqx.Module):
         return HighestDerivatives(self.equations, as_time(t, z.dtype), z, args, self.analysis)
 
     def split(self, y: Y) -> tuple[Array, Array | None]:
-        """The state `z`, and the leading derivatives where they belong to it."""
-        self.check(y)
-        if not self.analysis.implicit:
-            return y, None
-        states = self.analysis.layout.num_states
-        return y[:states], y[states:]
-
-    def check(self, y: Any) -> None:
-        """Refuse what is no state, such as the unknowns of the user's equations."""
+        """The state `z`, and the leading derivatives where they belong to it. Refuses what is no state,
+        such as the unknowns of the user's equations."""
         check_state(y, "z")
-        size = self.analysis.layout.num_states + len(self.analysis.c) * self.analysis.implicit
-        if eqx.is_array_like(y) and jnp.shape(y) == (size,):
-            return
-        raise ValueError(
-            f"The state of a reduced system is one vector of shape ({size},), with the names in `dae.report.states`; "
-            f"got {jtu.tree_map(jnp.shape, y)}. `dae.consistent_state` makes one from a guess of x; of many states "
-            "take `jax.vmap`."
-        )
+        states, implicit = self.analysis.layout.num_states, self.analysis.implicit
+        size = states + len(self.analysis.c) * implicit
+        if not eqx.is_array_like(y) or jnp.shape(y) != (size,):
+            raise ValueError(
+                f"The state of a reduced system is one vector of shape ({size},), with the names in `dae.report.states`; "
+                f"got {shapes(y)}. `dae.consistent_state` makes one from a guess of x; of many states take `jax.vmap`."
+            )
+        return (y[:states], y[states:]) if implicit else (y, None)
 
     def field(self, t: RealScalarLike, y: Float[Array, " states"], args: Args) -> Array:
         """The vector field on the state.

@@ -1,5 +1,6 @@
 """Linear systems with any regular matrix, factored once and solved for several right-hand sides."""
 
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -95,12 +96,13 @@ class InverseFactor(eqx.Module):
     """`A^-1` itself."""
 
     inverse: Float[Array, "n n"]
+    product: Callable = eqx.field(static=True)
 
     def solve(self, b: Float[Array, " n"]) -> Float[Array, " n"]:
-        return multiply(self.inverse, b)
+        return self.product(self.inverse, b)
 
     def solve_transposed(self, b: Float[Array, " n"]) -> Float[Array, " n"]:
-        return multiply(self.inverse.T, b)
+        return self.product(self.inverse.T, b)
 
 
 class Equilibrated(eqx.Module):
@@ -126,7 +128,7 @@ def factorize_equilibrated(A: Float[Array, "n n"]) -> Factorization:
     columns = one(jnp.max(jnp.abs(fixed) * rows[:, None], axis=0))
     scaled = fixed * rows[:, None] * columns[None, :]
     if A.shape[0] <= UNROLL_LIMIT:
-        factors = InverseFactor(reduction(scaled)[0])
+        factors = InverseFactor(reduction(scaled)[0], multiply)
         full_rank = jnp.max(jnp.abs(factors.inverse)) * threshold < 1  # not so of NaN
     else:
         factors = Library(jsl.lu_factor(scaled))
@@ -134,20 +136,10 @@ def factorize_equilibrated(A: Float[Array, "n n"]) -> Factorization:
     return Factorization(A, Equilibrated(rows, columns, factors), full_rank, multiply)
 
 
-class Elimination(eqx.Module):
-    """`A^-1` of any regular square matrix, by elimination with row exchanges. Not finite if `A` is
-    singular."""
-
-    A: Float[Array, "n n"]
-
-    def solve(self, b: Float[Array, "n ..."]) -> Float[Array, "n ..."]:
-        A = self.A
-        return jax.lax.custom_linear_solve(
-            lambda x: A @ x,
-            b,
-            lambda _, b: reduction(A)[0] @ b,
-            lambda _, b: reduction(A)[0].T @ b,
-        )
+def factorize_by_reduction(A: Float[Array, "n n"]) -> Factorization:
+    """Factor any matrix with row exchanges, without LAPACK. Not finite if it is singular."""
+    E, _ = reduction(jax.lax.stop_gradient(A))
+    return Factorization(A, InverseFactor(E, jnp.matmul), jnp.all(jnp.isfinite(E)), jnp.matmul)
 
 
 def reduction(A: Float[Array, "n k"]) -> tuple[Float[Array, "n n"], FloatScalar]:

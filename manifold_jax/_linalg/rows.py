@@ -82,3 +82,12 @@ def multiply(A: Rows, x: Float[Array, " n"]) -> Float[Array, " m"]:
     if A.shape[1] > UNROLL_LIMIT:
         return gram(A, x[None, :])[:, 0]
     return combine(x, A.T)
+
+
+def product(M: Float[Array, "..."], v: Float[Array, " n"]) -> Float[Array, " n"]:
+    """`M v` of a scalar, a diagonal, a matrix, or of the blocks `(b, d, d)` on its diagonal."""
+    if M.ndim < 2:
+        return M * v
+    if M.ndim == 2:
+        return multiply(M, v)
+    return jnp.sum(M * v.reshape(M.shape[0], 1, -1), axis=-1).reshape(-1)

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._linalg.dense import Factorization
-from .._linalg.rows import combine, multiply
+from .._linalg.rows import combine, multiply, product
 from .mass import InvertedBlocks, Mass
 
 
@@ -55,7 +55,7 @@ def solve_held_fixed(M: Any, factored: Factored, force: Float[Array, " n"], r: A
             momenta, force, r, factored.momenta, factored.momenta_transposed
         )
         return M.solve(p), multipliers
-    both = lambda a, z: (_apply(M, a) + combine(z, C), multiply(C, a))
+    both = lambda a, z: (product(M, a) + combine(z, C), multiply(C, a))
     return _solve_linear(both, force, r, factored.accelerations, factored.accelerations)
 
 
@@ -71,12 +71,3 @@ def _solve_linear(product: Any, force: Any, r: Any, solve: Any, solve_transposed
         lambda _, b: as_one(solve_transposed)(b),
     )
     return x[:n], x[n:]
-
-
-def _apply(M: Float[Array, "..."], a: Float[Array, " n"]) -> Float[Array, " n"]:
-    """`M a`, with `M` in one of the forms of `mass_values`."""
-    if M.ndim < 2:
-        return M * a
-    if M.ndim == 2:
-        return M @ a
-    return jnp.sum(M * a.reshape(M.shape[0], 1, -1), axis=-1).reshape(-1)

@@ -197,11 +197,9 @@ class MechanicalSystem(eqx.Module):
             redundant=self.redundant,
             structure=self.structure,
         )
-        return (
-            motion
-            if self.auxiliary is None
-            else ExtendedConstraint(motion=motion, auxiliary=self.auxiliary_constraint)  # pyright: ignore[reportCallIssue]
-        )
+        if self.auxiliary is None:
+            return motion
+        return ExtendedConstraint(motion=motion, auxiliary=self.auxiliary_constraint)  # pyright: ignore[reportCallIssue]
 
     @property
     def terms(self) -> dfx.AbstractTerm:

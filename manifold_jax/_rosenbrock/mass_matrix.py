@@ -18,7 +18,6 @@ from .._base.user_functions import check_function
 from .._constraint.checks import check_state
 from .._constraint.diagnosis import Diagnosis
 from .._constraint.projection_info import ProjectionInfo
-from .._linalg.rows import multiply
 from .algebraic import consistent, Equations, faults_of_start
 
 
@@ -178,8 +177,3 @@ def _check_numbers(mass: Any) -> None:
             )
     if not leaves:
         raise TypeError("`mass` is empty. Without a mass matrix use `diffrax.ODETerm(f)`.")
-
-
-def product(mass: Float[Array, "..."], v: Float[Array, " n"]) -> Float[Array, " n"]:
-    """`M v`."""
-    return multiply(mass, v) if mass.ndim == 2 else mass * v

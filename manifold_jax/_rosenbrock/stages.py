@@ -11,8 +11,8 @@ from .._base.types import BoolScalar
 from .._jaxpr.trace import num_equations
 from .._linalg.dense import Factorization
 from .._linalg.pivoted import factorize_pivoted
+from .._linalg.rows import product
 from .algebraic import as_matrix
-from .mass_matrix import product
 from .system import System, Vector
 from .tableau import RosenbrockTableau, Row
 

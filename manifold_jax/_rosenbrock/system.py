@@ -10,8 +10,9 @@ from jaxtyping import Array, Float
 
 from .._base.compat import directed, time_direction, undirected
 from .._base.types import Args, RealScalarLike, Y
+from .._linalg.rows import product
 from .algebraic import Linearized
-from .mass_matrix import mass_values, MassMatrixTerm, product, ravelled_like
+from .mass_matrix import mass_values, MassMatrixTerm, ravelled_like
 
 
 Vector = Float[Array, " n"]
