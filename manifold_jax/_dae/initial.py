@@ -23,7 +23,7 @@ from .._linalg.pivoted import factorize_equilibrated
 from .equations import leaf_names, listed
 from .highest_derivatives import HighestDerivatives
 from .layout import Gather, Layout
-from .nearest import nearest_state, with_lifted
+from .nearest import Constrained, nearest_state, with_lifted
 from .reduced import Reduced
 from .samples import condition, dependent_rows, singular_below
 
@@ -110,7 +110,7 @@ def consistent_state(
     t = as_time(t0, guess.z.dtype)
     z, info, regular = _found(system, t, guess, args)
     if throw:
-        _explain(system, t, system.split(z)[0], args, guess, info, regular)
+        _explain(system.closing(t, system.split(z)[0], args), guess, info, regular)
         near = info.residual <= NewtonProjection().tolerance_for(z.dtype)
         cause = jnp.where(info.full_rank, jnp.where(near, 2, 1), 0)
         cause = jnp.where(info.success, 0, cause)
@@ -133,7 +133,7 @@ def _found(
     w, finite, implicit = given.w, jnp.all(jnp.isfinite(given.z)), system.analysis.implicit
     guess = jnp.where(finite, given.z, 0)
     free = jnp.asarray(np.where(given.fixed, 0, 1), guess.dtype)
-    nearest = nearest_state(system, t, guess, w, free, args)
+    nearest = nearest_state(Constrained(system, t, args, free, w), guess)
     z = with_lifted(system, t, nearest.z, args)
     solvable = jnp.asarray(True)
     if implicit:
@@ -188,20 +188,13 @@ def _messages(guess: Guess) -> list[str]:
 
 
 def _explain(
-    system: Reduced,
-    t: Array,
-    z: Array,
-    args: Args,
-    guess: Guess,
-    info: ProjectionInfo,
-    regular: BoolScalar,
+    closing: HighestDerivatives, guess: Guess, info: ProjectionInfo, regular: BoolScalar
 ) -> None:
     """Where numbers are known, say which equations are singular."""
-    if any(isinstance(x, jax.core.Tracer) for x in jtu.tree_leaves((t, z, args, info))):
+    if any(isinstance(x, jax.core.Tracer) for x in jtu.tree_leaves((closing, info))):
         return
     if bool(info.success) or (any(guess.fixed) and bool(regular)):
         return
-    closing = system.closing(t, z, args)
     matrix = np.asarray(closing.matrix())
     if not np.isfinite(matrix).all():
         raise ValueError(
@@ -209,8 +202,8 @@ def _explain(
         )
     if condition(matrix) > 10 * singular_below(matrix.dtype):
         return
-    names = system.equations.names.equations
-    rows = system.analysis.rows[dependent_rows(matrix)]
+    names = closing.equations.names.equations
+    rows = closing.analysis.rows[dependent_rows(matrix)]
     raise ValueError(
         f"The equations {listed([names[i] for i in rows])} of `F`, differentiated as often as necessary, depend on each "
         "other at the start: they are redundant (remove one of them), or this is a singular configuration (start "

@@ -96,28 +96,19 @@ class NearestState(NamedTuple):
     settled: BoolScalar
 
 
-def nearest_state(
-    system: Reduced,
-    t: Array,
-    guess: Float[Array, " n"],
-    w: Float[Array, " k"],
-    free: Float[Array, " n"],
-    args: Args,
-) -> NearestState:
-    """Return the state nearest to the guess, of what holds without the unknowns that became
-    states, which stay where they are. `free` is the diagonal of `W^-1`, 0 for what is fixed."""
-    m = int(system.analysis.unlifted.c.sum())
+def nearest_state(g: Constrained, guess: Float[Array, " n"]) -> NearestState:
+    """Return the state nearest to the guess. Unknowns that became states stay where they are."""
+    m = int(g.system.analysis.unlifted.c.sum())
     if m == 0:
         none = jnp.zeros((0,), guess.dtype)
         return NearestState(guess, none, jnp.zeros((), jnp.int32), jnp.asarray(True))
-    g = Constrained(system, t, args, free, w)
     near = _approach(g, guess, m)
 
     def stationarity(x: Float[Array, " k"]) -> Float[Array, " k"]:
         z, multipliers = x[: guess.size], x[guess.size :]
         value, pullback = jax.vjp(g, z)
         (pull,) = pullback(multipliers)
-        return jnp.concatenate([z - guess + free * pull, value])
+        return jnp.concatenate([z - guess + g.free * pull, value])
 
     found = jnp.concatenate([near.z, near.multipliers])
     root = implicit_root(SquareSystem(convert_closure(stationarity, found)), found)

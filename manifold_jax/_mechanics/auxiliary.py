@@ -6,7 +6,7 @@ from typing import Any
 import jax.tree_util as jtu
 from jaxtyping import Array, Float
 
-from .._base.shapes import are_alike, shapes
+from .._base.shapes import shapes
 from .._base.types import Args, RealScalarLike, Y
 from .._constraint.constraint import AbstractConstraint
 from .._constraint.correction import ConstraintNormals
@@ -82,13 +82,6 @@ def split(y: Y) -> tuple[tuple[Y, Y], Y]:
     return (q, v), z
 
 
-def check_auxiliary_rates(rates: Any, z: Y) -> None:
-    if not are_alike(rates, z):
-        raise ValueError(
-            f"`auxiliary` must return h(t, q, v, z, args) of the structure and shapes of z, {shapes(z)}, got {shapes(rates)}."
-        )
-
-
 def _projections(projection: NewtonProjection, y: Y) -> tuple[NewtonProjection, NewtonProjection]:
     """Return the projections of the motion and of the auxiliary states, each with its part of the
     metric."""
@@ -96,8 +89,6 @@ def _projections(projection: NewtonProjection, y: Y) -> tuple[NewtonProjection, 
         return projection, projection
     if jtu.tree_structure(projection.metric) != jtu.tree_structure(y):
         projection.inverse_metric(y)  # says so
+    of_part = lambda metric: dataclasses.replace(projection, metric=metric)
     motion, z = split(projection.metric)
-    return (
-        dataclasses.replace(projection, metric=motion),
-        dataclasses.replace(projection, metric=z),
-    )
+    return of_part(motion), of_part(z)

@@ -80,7 +80,7 @@ class TwoStages(NamedTuple):
         return corrected, (_failed_unless(finite, positions), _failed_unless(finite, velocities))
 
     def normals(self, x: Float[Array, " k"], w: Float[Array, " k"]) -> "MechanicalNormals":
-        here = self.here.at(x, w)
+        here = self.here._replace(x=x, w=w)
         C, p = here.rows()
         directions, valid = self.directions, jnp.asarray(True)
         if directions is None and self.metrics is not None:
@@ -107,7 +107,7 @@ class TwoStages(NamedTuple):
 
     def _position_normals(self, x, normals: ConstraintNormals, p: int) -> ConstraintNormals:
         (C, directions), metrics = normals, self.metrics
-        J = self.here.at(x, x).position_rows(C, p)
+        J = self.here._replace(x=x, w=x).position_rows(C, p)
         if metrics is not None:  # one for positions of its own
             return ConstraintNormals(J, directions_of(InverseWeights(metrics.positions), J))
         if isinstance(directions, SparseRows):  # `J` may have too few rows for that

@@ -52,9 +52,6 @@ class Kinematics(NamedTuple):
         fields = system.nonholonomic, system.structure, jfu.ravel_pytree(y[0])[1]
         return Kinematics(system, *fields, as_time(t, x.dtype), x, w, args)
 
-    def at(self, x: Vector, w: Vector) -> "Kinematics":
-        return self._replace(x=x, w=w)
-
     def dense(self) -> "Kinematics":
         """The same, with Jacobians as arrays."""
         return self._replace(structure="dense")

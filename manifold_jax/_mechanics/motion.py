@@ -22,7 +22,7 @@ from .._linalg.dense import (
 from .._linalg.rows import AbstractRows, combine, directions_of, multiply
 from .auxiliary import split
 from .kinematics import Kinematics
-from .saddle_point import Factored, solve_held_fixed
+from .saddle_point import Factored, Pair, solve_held_fixed
 
 
 class LagrangianForce(eqx.Module):
@@ -69,10 +69,11 @@ class Motion:
             gram_matrix = gram_written_out(self.C, self.directions)
             self.factorization = (pseudo_invert if self.redundant else factorize)(gram_matrix)
 
-    def solve(self, bias: Float[Array, " m"]) -> tuple[Float[Array, " n"], Float[Array, " m"]]:
+    def solve(self, bias: Float[Array, " m"]) -> Pair:
         """Accelerations and multipliers of `M a + C^T lambda = Q`, `C a = -bias`."""
         force = self.force
-        if self._is_large() and isinstance(self.factorization, Factorization):
+        if isinstance(self.factorization, Factorization) and bias.size > UNROLL_LIMIT:
+            # The derivative of `C M^-1 C^T` would cost more than what is around it.
             M = self.here.mass_values()
             factored = Factored(self.C, self.directions, self.mass, self.factorization)
             pair = solve_held_fixed(M, factored, force, -bias)
@@ -93,10 +94,6 @@ class Motion:
             valid &= _agree(self.C, accelerations, bias)
         return _defined(accelerations, multipliers, valid)
 
-    def _is_large(self) -> bool:
-        """Whether the derivative of `C M^-1 C^T` would cost more than what is around it."""
-        return not isinstance(self.C, AbstractRows) and self.bias.size > UNROLL_LIMIT
-
     def constrained(self, b: Float[Array, " m"]) -> Float[Array, " n"]:
         """The smallest change of the velocities, in the metric of the masses, with `C dv = b`."""
         return combine(self.factorization.solve(b), self.directions)
@@ -112,10 +109,8 @@ class Motion:
         return self.here.w - combine(factorization.solve(rate), directions)
 
 
-def _defined(
-    a: Float[Array, " n"], multipliers: Float[Array, " m"], valid: BoolScalar
-) -> tuple[Float[Array, " n"], Float[Array, " m"]]:
-    # Added, not selected: the derivative of a discarded NaN would be NaN.
+def _defined(a: Float[Array, " n"], multipliers: Float[Array, " m"], valid: BoolScalar) -> Pair:
+    """NaN unless valid. Added, not selected: the derivative of a discarded NaN would be NaN."""
     undefined = jnp.where(valid, 0, jnp.nan).astype(a.dtype)
     return a + undefined, multipliers + undefined
 

@@ -10,12 +10,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._base.errors import refuse_old_names
+from .._base.shapes import are_alike, shapes
 from .._base.types import Args, RealScalarLike, Y
 from .._base.user_functions import check_function
 from .._constraint.constraint import AbstractConstraint
 from .._linalg.sparse import check_choice, Choice
 from .._solver.terms import DirectedTerm
-from .auxiliary import check_auxiliary_rates, ExtendedConstraint
+from .auxiliary import ExtendedConstraint
 from .constraint import MechanicalConstraint
 from .mass import ConfigurationMass, LagrangianMass
 from .motion import LagrangianForce, Motion
@@ -232,8 +233,11 @@ class MechanicalSystem(eqx.Module):
     def _auxiliary_rates(self, t: RealScalarLike, y: Y, args: Args) -> tuple[Y, ...]:
         if self.auxiliary is None:
             return ()
-        rates = self.auxiliary(t, *y, args)
-        check_auxiliary_rates(rates, y[2])
+        z, rates = y[2], self.auxiliary(t, *y, args)
+        if not are_alike(rates, z):
+            raise ValueError(
+                f"`auxiliary` must return h(t, q, v, z, args) of the structure and shapes of z, {shapes(z)}, got {shapes(rates)}."
+            )
         return (rates,)
 
     def _stabilized_field(self, t: RealScalarLike, y: Y, args: Args) -> tuple[Y, Y]:

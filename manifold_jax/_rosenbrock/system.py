@@ -34,9 +34,10 @@ class System(NamedTuple):
 
     @staticmethod
     def of(terms: Any, t0: RealScalarLike, t1: RealScalarLike, y0: Y, args: Args) -> "System":
-        mass = mass_matrix_term(terms)
-        if mass is not None:
-            terms = directed(dfx.ODETerm(mass.vector_field), time_direction(terms))
+        mass = undirected(terms)
+        if not isinstance(mass, MassMatrixTerm):
+            return System(terms, None, t0, t1, y0, args)
+        terms = directed(dfx.ODETerm(mass.vector_field), time_direction(terms))
         return System(terms, mass, t0, t1, y0, args)
 
     @property
@@ -91,9 +92,3 @@ class System(NamedTuple):
 
     def _unravel(self, x: Vector) -> Y:
         return jfu.ravel_pytree(self.y0)[1](x)
-
-
-def mass_matrix_term(terms: Any) -> MassMatrixTerm | None:
-    """Return the term of an equation with a mass matrix, also if time is negated."""
-    inner = undirected(terms)
-    return inner if isinstance(inner, MassMatrixTerm) else None
