@@ -6,11 +6,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from manifold_jax._dae.compressed import _colors
 from manifold_jax._dae.equations import Equations
-from manifold_jax._dae.occurrence import nonlinear_unknowns, Occurrence, Point
+from manifold_jax._dae.occurrence import Example, nonlinear_unknowns, Occurrence
 from manifold_jax._dae.signature import ABSENT, signature, SingularParts, Structure
 from manifold_jax._jaxpr.incidence import incidence
+from manifold_jax._linalg.coloring import greedy_colors
 
 
 def depends(function, n=6):
@@ -106,8 +106,8 @@ def test_asdex_agrees():
 
 def analyzed(model, x, args, order=1):
     equations = Equations.of(model, x, args, order)
-    point = Point.of(equations, jax.flatten_util.ravel_pytree(x)[0], args)
-    return equations, point, Occurrence.of(equations, point)
+    example = Example.of(equations, jax.flatten_util.ravel_pytree(x)[0], args)
+    return example, Occurrence.of(example)
 
 
 CASES = {
@@ -167,7 +167,7 @@ def pantelides(sigma):
 @pytest.mark.parametrize("case", CASES.values(), ids=CASES)
 def test_offsets_of_models(case):
     *model, index, freedom = case
-    _, _, occurrence = analyzed(*model)
+    _, occurrence = analyzed(*model)
     structure = Structure.of(signature(occurrence.there))
     assert (structure.index, structure.degrees_of_freedom) == (index, freedom)
     np.testing.assert_array_equal(structure.c, pantelides(structure.sigma))
@@ -203,7 +203,7 @@ def test_parts_of_a_singular_structure():
 
 
 def test_constant_coefficients():
-    _, _, occurrence = analyzed(CASES["pendulum"][0], *CASES["pendulum"][1:4])
+    _, occurrence = analyzed(CASES["pendulum"][0], *CASES["pendulum"][1:4])
     # of x' and v in x' - v, of v' in the equations of motion; not those of a circle
     constant = occurrence.there & ~occurrence.varies
     assert [row.nonzero()[0].tolist() for row in constant[:, 1]] == [[0], [1], [2], [3], []]
@@ -215,7 +215,7 @@ def test_constant_coefficients():
 
 def test_coefficients_that_depend_on_time_vary():
     model = lambda t, x, xdot, a: jnp.stack([jnp.cos(t) * xdot[0] - x[1], x[0] - t])
-    _, _, occurrence = analyzed(model, jnp.ones(2), None)
+    _, occurrence = analyzed(model, jnp.ones(2), None)
     assert occurrence.varies[0, 1, 0]
     assert not occurrence.varies[0, 0, 1]
     assert occurrence.depends_on_time.tolist() == [True, True]
@@ -226,9 +226,9 @@ def test_what_is_nonlinear_in_the_leading_derivatives():
     model = lambda t, x, xdot, a: jnp.stack(
         [xdot[0] * x[1] + x[2], jnp.sin(x[1]) + xdot[2] ** 2, x[2] * x[1]]
     )
-    equations, point, _ = analyzed(model, jnp.ones(3), None)
+    example, _ = analyzed(model, jnp.ones(3), None)
     levels, unknowns = np.array([1, 1, 1, 0]), np.array([0, 1, 2, 1])
-    found = nonlinear_unknowns(equations, point, levels, unknowns)
+    found = nonlinear_unknowns(example, levels, unknowns)
     assert found.tolist() == [
         [True, False, False, True],
         [False, False, True, True],
@@ -238,7 +238,7 @@ def test_what_is_nonlinear_in_the_leading_derivatives():
 
 def test_colors_never_conflict():
     conflict = np.random.default_rng(0).uniform(size=(30, 30)) < 0.1
-    colors = _colors(conflict)
+    colors = greedy_colors(conflict, most_conflicts_first=True)
     np.fill_diagonal(conflict, False)
     assert not (conflict & (colors[:, None] == colors[None, :])).any()
     assert colors.max() < 12

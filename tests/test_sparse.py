@@ -278,6 +278,26 @@ def test_bodies_that_are_not_connected():
     np.testing.assert_allclose(a, b, rtol=0, atol=1e-14)
 
 
+def test_positions_that_are_too_few_to_be_sparse_alone():
+    """Twenty equations for positions and twenty for velocities."""
+
+    def rods(t, q, args):
+        return jnp.sum(q.reshape(20, 3)[:, :2] ** 2, axis=1) - 1
+
+    def skates(t, q, v, args):
+        q, v = q.reshape(20, 3), v.reshape(20, 3)
+        return v[:, 2] - jnp.sin(q[:, 2]) * v[:, 0]
+
+    force = lambda t, q, v, args: -q
+    y = near((jnp.tile(jnp.array([0.6, 0.8, 0.3]), 20), jnp.linspace(0.1, 0.5, 60)))
+    corrected = []
+    for choice in ("auto", "dense"):
+        system = mj.MechanicalSystem(2.0, rods, force, velocity_constraint=skates, structure=choice)
+        assert system.constraint.is_sparse(0.0, y, None) == (choice == "auto")
+        corrected.append(jax.jit(lambda y, c=system.constraint: mj.project(c, 0.0, y)[0])(y))
+    assert largest_difference(*corrected) < 1e-13
+
+
 def test_dependent_equations_are_refused_at_the_start():
     system, problem = chain(6, "sparse")
     twice = lambda t, q, args: jnp.concatenate(

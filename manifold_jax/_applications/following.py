@@ -14,8 +14,8 @@ from .._constraint.constraint import Constraint
 from .._constraint.project import consistent_state
 from .._constraint.projection_info import ProjectionInfo
 from .._constraint.residual import jacobian
-from .._linalg.dense import Elimination, reduction
 from .._linalg.newton import without_derivative
+from .._linalg.pivoted import factorize_by_reduction, reduction
 from .._solve import diffeqsolve
 from .._solver import Projected
 
@@ -35,7 +35,7 @@ def _kernel_derivative(primals, tangents):
     """`G dtau = -dG tau`, `tau . dtau = 0`."""
     (G,), (dG,) = primals, tangents
     tau = kernel(G)
-    system = Elimination(jnp.concatenate([G, tau[None]]))
+    system = factorize_by_reduction(jnp.concatenate([G, tau[None]]))
     return tau, system.solve(jnp.append(-dG @ tau, 0 * tau[:1]))
 
 

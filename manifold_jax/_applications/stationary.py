@@ -9,8 +9,9 @@ from jaxtyping import Array, Float
 
 from .._base.types import Args, BoolScalar, FloatScalar
 from .._constraint.residual import jacobian, row_scale
-from .._linalg.dense import Elimination, Factorization, factorize, gram
+from .._linalg.dense import Factorization, factorize, gram
 from .._linalg.newton import AbstractEquations, find_root, implicit_root, without_derivative
+from .._linalg.pivoted import factorize_by_reduction
 
 
 class Lagrangian(eqx.Module):
@@ -36,7 +37,7 @@ class Lagrangian(eqx.Module):
     def normals(self, x: Float[Array, " n"]) -> tuple[Float[Array, "m n"], Factorization]:
         """`G = dg/dx` and the factors of `G G^T`."""
         _, G = jacobian(self.g, x)
-        return G, factorize(gram(G, G))  # pyright: ignore[reportReturnType]
+        return G, factorize(gram(G, G))
 
     def projected_gradient(
         self, x: Float[Array, " n"]
@@ -77,8 +78,8 @@ class _Conditions(AbstractEquations):
     def point(self, z: Float[Array, " n_plus_m"]) -> Float[Array, " n_plus_m"]:
         return z
 
-    def linearize(self, x: Float[Array, " n_plus_m"]) -> Elimination:
-        return Elimination(jax.jacfwd(self.residual)(x))
+    def linearize(self, x: Float[Array, " n_plus_m"]) -> Factorization:
+        return factorize_by_reduction(jax.jacfwd(self.residual)(x))
 
     def residual(self, x: Float[Array, " n_plus_m"]) -> Float[Array, " n_plus_m"]:
         x, multipliers = x[: self.n], x[self.n :]

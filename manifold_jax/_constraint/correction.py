@@ -18,7 +18,7 @@ from .._base.derivative_rule import ForwardRule
 from .._base.types import Args, BoolScalar, FloatScalar, IntScalar, RealScalarLike, Y
 from .._linalg.dense import factorize_once, gram, pseudo_invert
 from .._linalg.newton import AbstractEquations, chord, damped_newton, implicit_tangent
-from .._linalg.rows import AbstractRows, combine, InverseWeights, Rows
+from .._linalg.rows import AbstractRows, combine, directions_of, InverseWeights, Rows
 from .._linalg.sparse import SparseRows, Structure
 from .residual import as_time, jacobian, residual_vector, row_scale
 from .settings import NewtonProjection
@@ -37,7 +37,7 @@ class FactoredGram(NamedTuple):
     """The normals at a point with `G V` factored: the linearization of a correction."""
 
     normals: ConstraintNormals
-    factorization: Any  # Factorization | Inverse | PseudoInverse, or that of sparse rows
+    factorization: Any  # Factorization | Inverse, or that of sparse rows
 
     @staticmethod
     def of(
@@ -49,7 +49,7 @@ class FactoredGram(NamedTuple):
         A = gram(*normals)
         if not redundant:
             return FactoredGram(normals, factorize_once(A))
-        return FactoredGram(normals, pseudo_invert(A, equilibrated=True, dependent=dependent))
+        return FactoredGram(normals, pseudo_invert(A, dependent))
 
     def solve(self, b: Float[Array, " m"]) -> Float[Array, " m"]:
         return self.factorization.solve(b)
@@ -108,10 +108,7 @@ class CorrectionEquations(AbstractEquations):
             return ConstraintNormals(G, self.directions)
         if self.inverse_metric is None:
             return ConstraintNormals(G, G)
-        metric = InverseWeights(self.inverse_metric)
-        return ConstraintNormals(
-            G, G.along(metric) if isinstance(G, SparseRows) else metric.solve(G)
-        )
+        return ConstraintNormals(G, directions_of(InverseWeights(self.inverse_metric), G))
 
     def _rows(self, x: Float[Array, " n"]) -> Rows:
         if self.structure is None:

@@ -20,9 +20,12 @@ A pendulum, `F(t, x, x', args)` with the unknowns `x, y, u, v, lambda`, as an ex
   twice, which leaves sum(d) - sum(c) = 2 degrees of freedom; the index is 3.
 - `aliases.py`, `combined.py`: unknowns that are others under another name, equations from which derivatives
   cancel, so that the analysis is about what is left.
-- `pivots.py`, `layout.py`: which derivatives are states, and where each number is.
+- `layout.py`: which derivatives are states, and where each number is. `analysis.py` has all of this.
+- `compressed.py`, `samples.py`, `pivots.py`: the matrix of the leading derivatives, whether it is
+  regular, and what of it is eliminated beforehand.
 - `highest_derivatives.py`: the linear equations for `x'', y'', u', v', lambda`: the vector field.
-- `constraint.py`: E, its first derivative, and A, B where they are not eliminated: the manifold.
+- `reduced.py`: the field of the state, and E with its first derivative and A, B where they are not
+  eliminated: the manifold.
 - `initial.py`, `nearest.py`: consistent starts. `system.py`, `report.py`: what `reduce_dae` returns.
 """
 

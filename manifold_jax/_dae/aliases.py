@@ -7,13 +7,11 @@ are half of all.
 
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .equations import Equations
-from .occurrence import nonlinear_unknowns, Occurrence, Point
+from .occurrence import Example, nonlinear_unknowns, Occurrence
 from .signature import Structure
 
 
@@ -32,16 +30,21 @@ class Aliases(NamedTuple):
         return np.nonzero(self.root == np.arange(len(self.root)))[0]
 
     @property
+    def columns(self) -> np.ndarray:
+        """For each unknown the place of its root among those that are left."""
+        return np.searchsorted(self.roots, self.root)
+
+    @property
     def rows(self) -> np.ndarray:
         """The equations that are left."""
         return np.setdiff1d(np.arange(len(self.root)), self.equations)
 
     @staticmethod
-    def of(equations: Equations, occurrence: Occurrence, point: Point) -> "Aliases":
-        n = equations.n
+    def of(example: Example, occurrence: Occurrence) -> "Aliases":
+        n = example.equations.n
         root, shift, factor = np.arange(n), np.zeros(n, int), np.ones(n)
         used = []
-        for row, (unknown, order), target, ratio in _candidates(equations, occurrence, point):
+        for row, (unknown, order), target, ratio in _candidates(example, occurrence):
             new = root[unknown] != target and root[target] == target
             if not new:  # a second equation for it, or a chain that is closed
                 continue
@@ -54,8 +57,7 @@ class Aliases(NamedTuple):
 
     def merged(self, there: np.ndarray) -> np.ndarray:
         """Return, of an array `(equations, derivatives, unknowns)` of bools: that of the equations
-        and
-        unknowns that are left."""
+        and unknowns that are left."""
         n, levels = there.shape[1:][::-1]
         out = np.zeros((n, levels + int(self.shift.max(initial=0)), n), bool)
         for k in range(n):
@@ -63,7 +65,7 @@ class Aliases(NamedTuple):
         return out[self.rows][:, :, self.roots]
 
 
-def _candidates(equations: Equations, occurrence: Occurrence, point: Point) -> list[Any]:
+def _candidates(example: Example, occurrence: Occurrence) -> list[Any]:
     """Equations `a x^(s) + b v = 0` with constants `a`, `b`: `(row, (x, s), v, -a / b)`."""
     there = occurrence.there
     constant = ~(
@@ -72,9 +74,17 @@ def _candidates(equations: Equations, occurrence: Occurrence, point: Point) -> l
     two = (there.sum(axis=(1, 2)) == 2) & (there[:, 0].sum(axis=1) == 1) & constant
     if not two.any():
         return []
-    zero, ones = jnp.zeros_like(point.jets[0]), jnp.ones_like(point.jets[0])
-    higher = [zero] * equations.order
-    values, a, b = (np.asarray(x) for x in _along(equations, point, zero, ones, higher))
+
+    @jax.jit
+    def sums(t: Any, args: Any) -> Any:
+        """Of the values at zero, of the coefficients of derivatives, and of those of unknowns."""
+        at = lambda *jets: example.residual(t, jets, args)
+        zero, *higher = zeros = [jnp.zeros_like(x) for x in example.jets]
+        values, a = jax.jvp(at, zeros, [zero, *map(jnp.ones_like, higher)])
+        _, b = jax.jvp(at, zeros, [jnp.ones_like(zero), *higher])
+        return values, a, b
+
+    values, a, b = map(np.asarray, sums(example.t, example.args))
     found = []
     for row in np.nonzero(two & (values == 0) & (a != 0) & (b != 0))[0]:
         (order,), (unknown,) = np.nonzero(there[row, 1:])
@@ -84,23 +94,11 @@ def _candidates(equations: Equations, occurrence: Occurrence, point: Point) -> l
     return found
 
 
-def _along(equations: Equations, point: Point, zero: Any, ones: Any, higher: list) -> Any:
-    @jax.jit
-    def evaluate(t: Any, args: Any) -> Any:
-        args = eqx.combine(args, point.fixed_args)
-        at = lambda *jets: equations(t, jets, args)
-        values, a = jax.jvp(at, (zero, *higher), (zero, *(ones for _ in higher)))
-        _, b = jax.jvp(at, (zero, *higher), (ones, *higher))
-        return values, a, b
-
-    return evaluate(point.t, point.args)
-
-
-def lifted(equations: Equations, aliases: Aliases, structure: Structure, point: Point) -> Structure:
+def lifted(example: Example, aliases: Aliases, structure: Structure) -> Structure:
     """The structure with the fewest differentiations in which the equations with `c_i = 0`, too,
     are linear in the leading derivatives."""
     belongs_to = np.argsort(structure.transversal)
-    while (found := _nonlinear(equations, aliases, structure, point)).any():
+    while (found := _nonlinear(example, aliases, structure)).any():
         at_least = structure.c.copy()
         at_least[belongs_to[found]] += 1
         raised = Structure.of(structure.sigma, at_least)
@@ -109,16 +107,13 @@ def lifted(equations: Equations, aliases: Aliases, structure: Structure, point: 
     return structure
 
 
-def _nonlinear(
-    equations: Equations, aliases: Aliases, structure: Structure, point: Point
-) -> np.ndarray:
+def _nonlinear(example: Example, aliases: Aliases, structure: Structure) -> np.ndarray:
     """Return which of the leading derivatives occur nonlinearly in equations that are not
     differentiated."""
-    compact = np.searchsorted(aliases.roots, aliases.root)
-    levels = structure.d[compact] - aliases.shift
-    (unknowns,) = np.nonzero((levels >= 0) & (levels <= equations.order))
-    depends = nonlinear_unknowns(equations, point, levels[unknowns], unknowns)
+    levels = structure.d[aliases.columns] - aliases.shift
+    (unknowns,) = np.nonzero((levels >= 0) & (levels <= example.equations.order))
+    depends = nonlinear_unknowns(example, levels[unknowns], unknowns)
     there = depends[aliases.rows[structure.c == 0]].any(axis=0)
     found = np.zeros(len(structure.d), bool)
-    found[compact[unknowns[there]]] = True
+    found[aliases.columns[unknowns[there]]] = True
     return found

@@ -11,23 +11,37 @@ place of one of the equations.
 import functools
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
 from .._jaxpr.incidence import incidence
-from .aliases import Aliases
-from .equations import Combination, Equations
-from .layout import Layout
-from .occurrence import Occurrence, Point
+from .analysis import Analysis
+from .equations import Combination
+from .occurrence import Example, Occurrence, tracked
 from .samples import singular_below
 
 
 # Of a sum that should be zero, relative to its parts.
 _ROUNDING = 1e-12
 _POINTS = 3
+
+
+def without_cancellations(found: Analysis) -> Analysis:
+    """Add combinations of equations from which derivatives are gone, as long as there are some."""
+    while found.samples.singular and (repairs := cancelled(found)):
+        equations = found.example.equations
+        for repair in repairs:
+            equations = equations.combined(repair.combination)
+        example = found.example._replace(equations=equations)
+        gone = {repair.combination.row: repair.gone for repair in repairs}
+        occurrence = Occurrence.of(example).without(found.occurrence, gone)
+        better = Analysis.of(example, occurrence, found.implicit)
+        if better is None:
+            return found
+        found = better
+    return found
 
 
 class Cancelled(NamedTuple):
@@ -38,66 +52,51 @@ class Cancelled(NamedTuple):
     gone: np.ndarray
 
 
-def cancelled(
-    equations: Equations,
-    occurrence: Occurrence,
-    aliases: Aliases,
-    layout: Layout,
-    matrices: list[np.ndarray],
-    point: Point,
-) -> list[Cancelled]:
+def cancelled(analysis: Analysis) -> list[Cancelled]:
     """Return the cancellations among equations that are differentiated equally often: those that
-    hold for other parameters and
-    times, too, and of which none changes an equation that another one needs."""
-    jacobians = _jacobians(equations, occurrence.there, point)
+    hold for other parameters and times, too, and of which none changes an equation that another one
+    needs."""
+    example, occurrence, layout = analysis.example, analysis.occurrence, analysis.layout
+    jacobians = _jacobians(example, occurrence.there)
     found: list[Cancelled] = []
-    for weights in _common_null_vectors(matrices):
+    for weights in _common_null_vectors(analysis.samples.matrices):
         (used,) = np.nonzero(weights)
-        if len(used) < 2 or len(set(layout.structure.c[used].tolist())) > 1:
+        if len(used) < 2 or len(set(analysis.c[used].tolist())) > 1:
             continue
-        rows = aliases.rows[used]
+        rows, weights = analysis.rows[used], weights[used]
         if any(other.combination.row in rows for other in found):
             continue
-        constant = ~occurrence.varies[rows].any(axis=0) | _constant(
-            equations, rows, weights[used], point
-        )
-        gone = constant & _vanishes(jacobians, rows, weights[used])
-        leading = aliases.merged(gone[None])[0]
-        highest = layout.structure.d - layout.structure.c[used[0]]
-        stands = aliases.merged(occurrence.there[rows].any(axis=0)[None])[0]  # pyright: ignore[reportIndexIssue]
-        columns = np.arange(len(highest))
-        inside = highest >= 0
-        at = np.maximum(highest, 0), columns
-        if (inside & stands[at] & ~leading[at]).any():
+        constant = ~occurrence.varies[rows].any(axis=0) | _constant(example, rows, weights)
+        gone = constant & _vanishes(jacobians, rows, weights)
+        leading = layout.aliases.merged(gone[None])[0]
+        highest = layout.structure.d - analysis.c[used[0]]
+        stands = layout.aliases.merged(occurrence.there[rows].any(axis=0)[None])[0]  # pyright: ignore[reportIndexIssue]
+        at = np.maximum(highest, 0), np.arange(len(highest))
+        if ((highest >= 0) & stands[at] & ~leading[at]).any():
             continue
-        target = int(rows[np.argmax(np.abs(weights[used]))])
-        parts = tuple(zip(rows.tolist(), weights[used].tolist(), strict=True))
+        target = int(rows[np.argmax(np.abs(weights))])
+        parts = tuple(zip(rows.tolist(), weights.tolist(), strict=True))
         found.append(Cancelled(Combination(target, parts), gone))
     return found
 
 
-def _constant(
-    equations: Equations, rows: np.ndarray, weights: np.ndarray, point: Point
-) -> np.ndarray:
+def _constant(example: Example, rows: np.ndarray, weights: np.ndarray) -> np.ndarray:
     """Which coefficients of the weighted sum do not depend on anything, shape `(levels, n)`. Read
     off its gradient, where what is added and subtracted meets before it is multiplied."""
-    cotangent = np.zeros(equations.n)
+    shape = len(example.jets), example.equations.n
+    cotangent = np.zeros(example.equations.n)
     cotangent[rows] = weights
 
     def gradient(t: Array, jets: tuple[Array, ...], args: object) -> Array:
-        along = lambda jets: equations(t, jets, eqx.combine(args, point.fixed_args))
-        _, pullback = jax.vjp(along, jets)
+        _, pullback = jax.vjp(lambda jets: example.residual(t, jets, args), jets)
         return jnp.concatenate(pullback(jnp.asarray(cotangent, jets[0].dtype))[0])
 
-    anything = lambda tree: np.ones(
-        (sum(int(np.size(leaf)) for leaf in jax.tree_util.tree_leaves(tree)), 1), bool
-    )
-    tracked = [(tree, anything(tree)) for tree in (point.t, point.jets, point.args)]
+    anything = np.ones(1, bool)
+    inputs = [tracked(tree, anything) for tree in (example.t, example.jets, example.args)]
     try:
-        varies = incidence(gradient, *tracked).depends[:, 0]
+        return ~incidence(gradient, *inputs).depends[:, 0].reshape(shape)
     except (ValueError, NotImplementedError):  # no gradient, as of `while_loop`
-        varies = np.ones(cotangent.size * len(point.jets), bool)
-    return ~varies.reshape(len(point.jets), equations.n)
+        return np.zeros(shape, bool)
 
 
 def _vanishes(jacobians: list[np.ndarray], rows: np.ndarray, weights: np.ndarray) -> np.ndarray:
@@ -111,8 +110,8 @@ def _vanishes(jacobians: list[np.ndarray], rows: np.ndarray, weights: np.ndarray
 
 def _common_null_vectors(matrices: list[np.ndarray]) -> list[np.ndarray]:
     """Return the common null vectors with few numbers that are not zero, the first positive, the
-    largest of them 1. Columns of each matrix are scaled
-    for themselves: exponential functions differ by many decades from sample to sample."""
+    largest of them 1. Columns of each matrix are scaled for themselves: exponential functions differ
+    by many decades from sample to sample."""
     every = np.concatenate(matrices, axis=1)
     scale = np.ones(len(every))
     for _ in range(3):
@@ -137,13 +136,13 @@ def _common_null_vectors(matrices: list[np.ndarray]) -> list[np.ndarray]:
     return found
 
 
-def _jacobians(equations: Equations, there: np.ndarray, point: Point) -> list[np.ndarray]:
+def _jacobians(example: Example, there: np.ndarray) -> list[np.ndarray]:
     """Return the Jacobians with respect to all derivatives, `(n, levels, n)`, at other times,
     values and parameters."""
 
     @jax.jit
     def jacobian(t: Array, jets: tuple[Array, ...], args: object) -> Array:
-        along = lambda jets: equations(t, jets, eqx.combine(args, point.fixed_args))
+        along = lambda jets: example.residual(t, jets, args)
         return jnp.stack(jax.jacfwd(along)(jets), axis=1)
 
     random = np.random.default_rng(1)
@@ -157,7 +156,8 @@ def _jacobians(equations: Equations, there: np.ndarray, point: Point) -> list[np
 
     found = []
     for k in range(_POINTS):
-        args, jets = jax.tree_util.tree_map(functools.partial(moved, k=k), (point.args, point.jets))
-        J = jacobian(jnp.asarray(random.uniform(), point.t.dtype), jets, args)
+        inputs = example.args, example.jets
+        args, jets = jax.tree_util.tree_map(functools.partial(moved, k=k), inputs)
+        J = jacobian(jnp.asarray(random.uniform(), example.t.dtype), jets, args)
         found.append(np.where(there, np.asarray(J), 0))
     return found

@@ -1,5 +1,4 @@
-"""Jacobians with a known pattern from few directional derivatives (Curtis, Powell & Reid, J. Inst.
-Maths Applics 13 (1974) 117-119)."""
+"""Jacobians with a known pattern from few directional derivatives."""
 
 from typing import Any, NamedTuple
 
@@ -9,6 +8,7 @@ import numpy as np
 from jaxtyping import Array
 
 from .._base.types import Args
+from .._linalg.coloring import greedy_colors
 from .aliases import Aliases
 from .derivatives import pick
 from .signature import Structure
@@ -31,11 +31,10 @@ class Compressed(NamedTuple):
         needed = np.zeros((len(structure.c), len(pairs)))
         needed[rows, which] = 1
         met = there[:, pairs[:, 0], pairs[:, 1]].astype(float)
-        colors = _colors(needed.T @ met > 0)
+        colors = greedy_colors(needed.T @ met > 0, most_conflicts_first=True)
         seeds = np.zeros((int(colors.max(initial=-1)) + 1, levels, len(aliases.root)))
-        compact = np.searchsorted(aliases.roots, aliases.root)
         for (order, column), color in zip(pairs, colors, strict=True):
-            for unknown in np.nonzero(compact == column)[0]:
+            for unknown in np.nonzero(aliases.columns == column)[0]:
                 level = order - aliases.shift[unknown]
                 if 0 <= level < levels:
                     seeds[color, level, unknown] = aliases.factor[unknown]
@@ -59,14 +58,3 @@ class Compressed(NamedTuple):
 
     def matrix(self, derivatives: Array) -> Array:
         return self.block(derivatives, *map(np.arange, self.places.shape))
-
-
-def _colors(conflict: np.ndarray) -> np.ndarray:
-    """Greedily, those with the most conflicts first."""
-    conflict = conflict | conflict.T
-    np.fill_diagonal(conflict, False)
-    colors = np.full(len(conflict), -1)
-    for i in np.argsort(-conflict.sum(axis=0), kind="stable"):
-        taken = set(colors[conflict[i]])
-        colors[i] = next(color for color in range(len(colors)) if color not in taken)
-    return colors

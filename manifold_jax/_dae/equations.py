@@ -1,5 +1,6 @@
 """The equations `F(t, x, x', ..., args) = 0` as a function of vectors."""
 
+import dataclasses
 import functools
 import itertools
 import operator
@@ -82,9 +83,9 @@ class Equations(eqx.Module):
         return values
 
     def combined(self, combination: Combination) -> "Equations":
-        names = self.names.combined(combination)
         every = (*self.combinations, combination)
-        return Equations(self.function, self.order, self.shapes, names, every)
+        names = self.names.combined(combination)
+        return dataclasses.replace(self, names=names, combinations=every)
 
     @staticmethod
     def of(function: Callable, x: Any, args: Args, order: int) -> "Equations":

@@ -18,14 +18,17 @@ from .._constraint.projection_info import ProjectionInfo
 from .._constraint.residual import as_time, jacobian, row_scale
 from .._constraint.settings import NewtonProjection
 from .._linalg.dense import gram
-from .._linalg.newton import without_derivative
-from .constraint import hidden_constraints, Reduced
+from .._linalg.newton import find_root, implicit_root, SquareSystem, without_derivative
+from .._linalg.pivoted import factorize_equilibrated
 from .equations import leaf_names, listed
-from .implicit import leading
+from .highest_derivatives import HighestDerivatives
 from .layout import Gather, Layout
-from .nearest import nearest_state, with_lifted
-from .pivots import Pivoted
+from .nearest import Constrained, nearest_state, with_lifted
+from .reduced import Reduced
 from .samples import condition, dependent_rows, singular_below
+
+
+_MOST_STEPS = 100
 
 
 class Guess(NamedTuple):
@@ -33,14 +36,14 @@ class Guess(NamedTuple):
 
     z: Float[Array, " states"]
     w: Float[Array, " n"]  # leading derivatives
-    fixed: np.ndarray
+    fixed: tuple[bool, ...]
     names: tuple[str, ...]  # of what is fixed, as given
 
     @staticmethod
     def of(system: Reduced, x: Y, derivatives: Any, fixed: Any) -> "Guess":
         given = [_flat(system, x, "x_guess")]
         given += [_flat(system, dx, f"derivatives[{k}]") for k, dx in enumerate(derivatives)]
-        layout, every = system.static.plan.layout, jnp.concatenate(given)
+        layout, every = system.analysis.layout, jnp.concatenate(given)
         z, w = (
             _places_in_guess(layout, names, len(given))(every, None)
             for names in (layout.names, layout.leading_names())
@@ -79,13 +82,13 @@ def _flat(system: Reduced, x: Y, name: str) -> Array:
     return jfu.ravel_pytree(floating)[0]
 
 
-def _fixed(system: Reduced, x: Y, fixed: Any) -> np.ndarray:
+def _fixed(system: Reduced, x: Y, fixed: Any) -> tuple[bool, ...]:
     if isinstance(fixed, str) or not all(isinstance(name, str) for name in fixed):
         raise TypeError(
             f"`fixed` must be a tuple of names, such as ('{system.equations.names.unknowns[0]}',), got {fixed!r}."
         )
-    plan, unknowns = system.static.plan, system.equations.names
-    states = [unknowns.derivative(j, k) for k, j in plan.layout.names.tolist()]
+    names = system.analysis.layout.names.tolist()
+    states = [system.equations.names.derivative(unknown, k) for k, unknown in names]
     groups = dict(leaf_names(x, "x"))
     held = np.zeros(len(states), bool)
     for name in fixed:
@@ -98,16 +101,16 @@ def _fixed(system: Reduced, x: Y, fixed: Any) -> np.ndarray:
                 "is not in the state follows from it."
             )
         held |= np.isin(states, numbers)
-    return held
+    return tuple(held.tolist())
 
 
 def consistent_state(
     system: Reduced, t0: RealScalarLike, guess: Guess, args: Args, throw: bool
 ) -> tuple[Array, ProjectionInfo]:
     t = as_time(t0, guess.z.dtype)
-    z, info, regular = _found(system, t, guess.z, guess.w, tuple(guess.fixed.tolist()), args)
+    z, info, regular = _found(system, t, guess, args)
     if throw:
-        _explain(system, t, system.split(z)[0], args, guess, info, regular)
+        _explain(system.closing(t, system.split(z)[0], args), guess, info, regular)
         near = info.residual <= NewtonProjection().tolerance_for(z.dtype)
         cause = jnp.where(info.full_rank, jnp.where(near, 2, 1), 0)
         cause = jnp.where(info.success, 0, cause)
@@ -124,29 +127,26 @@ def _raise_unless(success: BoolScalar, z: Array, cause: Array, messages: tuple[s
 @numbers_as_arrays("args")
 @eqx.filter_jit
 def _found(
-    system: Reduced, t: Array, guess: Array, w: Array, held: tuple[bool, ...], args: Args
+    system: Reduced, t: Array, given: Guess, args: Args
 ) -> tuple[Array, ProjectionInfo, BoolScalar]:
     """The state, what was done, and whether the derivatives are determined there."""
-    fixed = np.array(held, bool)
-    given, finite = guess, jnp.all(jnp.isfinite(guess))
-    guess = jnp.where(finite, guess, 0)
-    nearest = nearest_state(system, t, guess, w, fixed, args)
+    w, finite, implicit = given.w, jnp.all(jnp.isfinite(given.z)), system.analysis.implicit
+    guess = jnp.where(finite, given.z, 0)
+    free = jnp.asarray(np.where(given.fixed, 0, 1), guess.dtype)
+    nearest = nearest_state(Constrained(system, t, args, free, w), guess)
     z = with_lifted(system, t, nearest.z, args)
     solvable = jnp.asarray(True)
-    if system.static.plan.implicit:
-        w, solvable = leading(system.closing(t, z, args), w)
+    if implicit:
+        w, solvable = _leading(system.closing(t, z, args), w)
     closing, fixed_w = without_derivative((system.closing(t, z, args), w))
     regular = closing.linearize(fixed_w).full_rank
-    c = system.static.plan.layout.structure.c
-    constraint = lambda z: hidden_constraints(
-        system, closing.t, z, closing.args, np.zeros_like(c), c, fixed_w
-    )
-    r, G = jacobian(constraint, closing.z)
-    level = jnp.zeros((), guess.dtype)  # there may be no state at all
-    if r.size > 0:
+    t, args, c = closing.t, closing.args, system.analysis.c
+    residual = lambda z: system.hidden_constraints(t, z, args, 0, c, fixed_w)
+    r, G = jacobian(residual, closing.z)
+    level, full_rank = jnp.zeros((), guess.dtype), jnp.asarray(True)
+    if r.size > 0:  # or there may be no state at all
         level = jnp.max(jnp.abs(r) / row_scale(G, closing.z))
-    moving = G * jnp.asarray(np.where(fixed, 0, 1), G.dtype)[None, :]
-    full_rank = Pivoted.of(gram(G, moving)).full_rank if r.size > 0 else jnp.asarray(True)
+        full_rank = factorize_equilibrated(gram(G, G * free[None, :])).full_rank
     near = level <= NewtonProjection().tolerance_for(z.dtype)
     success = finite & near & nearest.settled & full_rank & regular & solvable
     correction = jnp.max(jnp.abs(closing.z - guess) / (jnp.abs(guess) + 1), initial=0)
@@ -158,8 +158,20 @@ def _found(
         full_rank=full_rank,
         success=success,
     )
-    z = jnp.where(finite, z, given)
-    return jnp.concatenate([z, w]) if system.static.plan.implicit else z, info, regular
+    z = jnp.where(finite, z, given.z)
+    return jnp.concatenate([z, w]) if implicit else z, info, regular
+
+
+def _leading(
+    closing: HighestDerivatives, guess: Float[Array, " k"]
+) -> tuple[Float[Array, " k"], BoolScalar]:
+    """The derivatives near a guess, and whether they solve the equations."""
+    equations = SquareSystem(closing.residual, closing.matrix)
+    fixed, tolerance = without_derivative(equations), NewtonProjection().tolerance_for(guess.dtype)
+    found = find_root(equations, guess, _MOST_STEPS, tolerance)
+    change = fixed.linearize(found).solve(fixed.residual(found))
+    small = jnp.max(jnp.abs(change) / (1 + jnp.abs(found)), initial=0) <= 1e3 * tolerance
+    return implicit_root(equations, found), jax.lax.stop_gradient(small)
 
 
 def _messages(guess: Guess) -> list[str]:
@@ -176,20 +188,13 @@ def _messages(guess: Guess) -> list[str]:
 
 
 def _explain(
-    system: Reduced,
-    t: Array,
-    z: Array,
-    args: Args,
-    guess: Guess,
-    info: ProjectionInfo,
-    regular: BoolScalar,
+    closing: HighestDerivatives, guess: Guess, info: ProjectionInfo, regular: BoolScalar
 ) -> None:
     """Where numbers are known, say which equations are singular."""
-    if any(isinstance(x, jax.core.Tracer) for x in jtu.tree_leaves((t, z, args, info))):
+    if any(isinstance(x, jax.core.Tracer) for x in jtu.tree_leaves((closing, info))):
         return
-    if bool(info.success) or (guess.fixed.any() and bool(regular)):
+    if bool(info.success) or (any(guess.fixed) and bool(regular)):
         return
-    closing = system.closing(t, z, args)
     matrix = np.asarray(closing.matrix())
     if not np.isfinite(matrix).all():
         raise ValueError(
@@ -197,8 +202,8 @@ def _explain(
         )
     if condition(matrix) > 10 * singular_below(matrix.dtype):
         return
-    names = system.equations.names.equations
-    rows = system.static.plan.layout.aliases.rows[dependent_rows(matrix)]
+    names = closing.equations.names.equations
+    rows = closing.analysis.rows[dependent_rows(matrix)]
     raise ValueError(
         f"The equations {listed([names[i] for i in rows])} of `F`, differentiated as often as necessary, depend on each "
         "other at the start: they are redundant (remove one of them), or this is a singular configuration (start "

@@ -29,9 +29,8 @@ class Gather(NamedTuple):
 
 class Layout(NamedTuple):
     """The layout of the state `z`: for each number the derivative and the unknown under whose name
-    it goes
-    (`names`), and for each that is left of the unknowns the place of its derivatives below `d_j`
-    (`places[m, j]`, then that of `x_j^(d_j)` in the leading derivatives `w`, behind `z`)."""
+    it goes (`names`), and for each that is left of the unknowns the place of its derivatives below
+    `d_j` (`places[m, j]`, then that of `x_j^(d_j)` in the leading derivatives `w`, behind `z`)."""
 
     structure: Structure
     aliases: Aliases
@@ -57,13 +56,11 @@ class Layout(NamedTuple):
     def of(structure: Structure, aliases: Aliases, order: int) -> "Layout":
         """The user's own unknowns first, in their order, then derivatives without a name."""
         n, d = len(aliases.root), structure.d
-        compact = np.full(n, -1)
-        compact[aliases.roots] = np.arange(len(aliases.roots))
         places = np.full((int(d.max(initial=0)) + 1, len(d)), -1)
         names = []
         for k in range(int(d.max(initial=0)) + 1):
             for unknown in range(n):
-                m, j = k + aliases.shift[unknown], compact[aliases.root[unknown]]
+                m, j = k + aliases.shift[unknown], aliases.columns[unknown]
                 if m < d[j] and places[m, j] < 0:
                     places[m, j] = len(names)
                     names.append((k, unknown))
@@ -79,8 +76,7 @@ class Layout(NamedTuple):
 
     def jet(self, k: int, further: int = 0) -> Gather:
         """Derivative `k` of all unknowns, with `further` derivatives of `w` known (behind it)."""
-        d = self.structure.d
-        j = np.searchsorted(self.aliases.roots, self.aliases.root)
+        d, j = self.structure.d, self.aliases.columns
         level = k + self.aliases.shift
         inside = level < len(self.places)
         index = np.where(inside, self.places[np.where(inside, level, 0), j], -1)
@@ -92,18 +88,11 @@ class Layout(NamedTuple):
 
     def most_beyond(self, k: int) -> int:
         """Derivatives of `w` that derivative `k` of all unknowns takes."""
-        j = np.searchsorted(self.aliases.roots, self.aliases.root)
-        return max(0, int((k + self.aliases.shift - self.structure.d[j]).max(initial=0)))
+        highest = self.structure.d[self.aliases.columns]
+        return max(0, int((k + self.aliases.shift - highest).max(initial=0)))
 
     def rate(self) -> Gather:
         """The derivative of the state."""
         level, unknown = self.names.T
-        j = np.searchsorted(self.aliases.roots, self.aliases.root[unknown])
-        index = self.places[level + self.aliases.shift[unknown] + 1, j]
+        index = self.places[level + self.aliases.shift[unknown] + 1, self.aliases.columns[unknown]]
         return Gather(index, self.scale() / self._scales()[index])
-
-    def jets(
-        self, z: Float[Array, " a"], w: Float[Array, " b"] | None, number: int
-    ) -> tuple[Float[Array, " n"], ...]:
-        """The first derivatives of all unknowns, as far as they are known; else zero."""
-        return tuple(self.jet(k)(z, w) for k in range(number))

@@ -14,25 +14,34 @@ from .derivatives import pick
 from .equations import Equations
 
 
-class Point(NamedTuple):
-    """Where equations are evaluated: a time, the vectors `(x, x', ...)` and parameters, of which
-    the arrays can be traced."""
+class Example(NamedTuple):
+    """Equations, and where they are evaluated: a time, the vectors `(x, x', ...)` and parameters, of
+    which the arrays can be traced."""
 
+    equations: Equations
     t: Array
     jets: tuple[Array, ...]
     args: Any
     fixed_args: Any
 
     @staticmethod
-    def of(equations: Equations, x: Array, args: Args) -> "Point":
-        """Return the point with derivatives of zero. Floats in `args` are parameters like arrays
-        are; whole numbers
+    def of(equations: Equations, x: Array, args: Args) -> "Example":
+        """With derivatives of zero. Floats in `args` are parameters like arrays are; whole numbers
         and everything else are taken as they are."""
         is_parameter = lambda leaf: eqx.is_inexact_array_like(leaf) or eqx.is_array(leaf)
         traced, fixed = eqx.partition(args, is_parameter)
         traced = jax.tree_util.tree_map(jnp.asarray, traced)
         jets = (x, *(jnp.zeros_like(x) for _ in range(equations.order)))
-        return Point(jnp.zeros((), x.dtype), jets, traced, fixed)
+        return Example(equations, jnp.zeros((), x.dtype), jets, traced, fixed)
+
+    def residual(self, t: Array, jets: tuple[Array, ...], args: Any) -> Array:
+        return self.equations(t, jets, eqx.combine(args, self.fixed_args))
+
+
+def tracked(tree: Any, inputs: np.ndarray) -> tuple[Any, np.ndarray]:
+    """For `incidence`: every number of `tree` counts as these inputs."""
+    size = sum(int(np.size(leaf)) for leaf in jax.tree_util.tree_leaves(tree))
+    return tree, np.tile(inputs, (size, 1))
 
 
 class Occurrence(NamedTuple):
@@ -48,24 +57,23 @@ class Occurrence(NamedTuple):
     unknown_primitives: dict[str, int]
 
     @staticmethod
-    def of(equations: Equations, point: Point) -> "Occurrence":
-        n, levels = equations.n, equations.order + 1
-        tracked = _inputs(point, n * levels)
-
-        def residual(t: Array, jets: tuple[Array, ...], args: Any) -> Array:
-            return equations(t, jets, eqx.combine(args, point.fixed_args))
+    def of(example: Example) -> "Occurrence":
+        """The time and all parameters together count as one input each, after those of the jets."""
+        shape = n, levels, _ = example.equations.n, example.equations.order + 1, example.equations.n
+        each = np.eye(n * levels, n * levels + 2, dtype=bool)
+        time, parameters = np.eye(2, n * levels + 2, n * levels, dtype=bool)
+        args = tracked(example.args, parameters)
+        inputs = tracked(example.t, time), (example.jets, each), args
 
         def rate(t: Array, jets: tuple[Array, ...], args: Any, dt: Array, rates: Any) -> Array:
             """Where it does not depend on a number, the coefficient of that number is constant:
             second derivatives are symmetric."""
-            along = lambda t, jets: residual(t, jets, args)
+            along = lambda t, jets: example.residual(t, jets, args)
             return jax.jvp(along, (t, jets), (dt, rates))[1]
 
-        values = incidence(residual, *tracked)
-        nothing = np.zeros_like(tracked[0][1]), np.zeros_like(tracked[1][1])
-        directions = (point.t, nothing[0]), (point.jets, nothing[1])
-        slopes = incidence(rate, *tracked, *directions)
-        shape = n, levels, n
+        values = incidence(example.residual, *inputs)
+        directions = [tracked(tree, np.zeros_like(time)) for tree in (example.t, example.jets)]
+        slopes = incidence(rate, *inputs, *directions)
         return Occurrence(
             there=values.depends[:, :-2].reshape(shape),
             varies=slopes.depends[:, :-2].reshape(shape),
@@ -77,45 +85,31 @@ class Occurrence(NamedTuple):
 
     def without(self, before: "Occurrence", gone: dict[int, np.ndarray]) -> "Occurrence":
         """Return the occurrence in equations of which some were replaced: `gone[row][k, j]` is not
-        in them, the others
-        are those of `before`."""
+        in them, the others are those of `before`."""
         there = before.there.copy()
         for row, away in gone.items():
             there[row] = self.there[row] & ~away
         return self._replace(there=there)
 
 
-def _inputs(point: Point, number: int) -> tuple[tuple[Any, np.ndarray], ...]:
-    """The time and all parameters together count as one input each, after those of the jets."""
-    leaves = jax.tree_util.tree_leaves(point.args)
-    each = np.eye(number, number + 2, dtype=bool)
-    one = lambda which, size: np.tile(np.arange(number + 2) == number + which, (size, 1))
-    args = one(1, sum(int(np.size(leaf)) for leaf in leaves))
-    return (point.t, one(0, 1)), (point.jets, each), (point.args, args)
-
-
-def nonlinear_unknowns(
-    equations: Equations, point: Point, levels: np.ndarray, unknowns: np.ndarray
-) -> np.ndarray:
+def nonlinear_unknowns(example: Example, levels: np.ndarray, unknowns: np.ndarray) -> np.ndarray:
     """Return in which of the derivatives `levels` of the `unknowns`, which are changed together,
-    each
-    equation is not linear: shape `(n, number)`."""
-    number = len(levels)
-    leading = jnp.zeros(number, point.jets[0].dtype)
+    each equation is not linear: shape `(n, number)`."""
+    n, number = example.equations.n, len(levels)
+    leading = jnp.zeros(number, example.jets[0].dtype)
 
     def residual(w: Array, t: Array, jets: tuple[Array, ...], args: Any) -> Array:
         changed = []
         for k, x in enumerate(jets):
-            index, here = np.arange(equations.n), levels == k
-            index[unknowns[here]] = equations.n + np.nonzero(here)[0]
+            index, here = np.arange(n), levels == k
+            index[unknowns[here]] = n + np.nonzero(here)[0]
             changed.append(pick(jnp.concatenate([x, w]), index))
-        return equations(t, tuple(changed), eqx.combine(args, point.fixed_args))
+        return example.residual(t, tuple(changed), args)
 
     def rate(w: Array, dw: Array, t: Array, jets: tuple[Array, ...], args: Any) -> Array:
         return jax.jvp(lambda w: residual(w, t, jets, args), (w,), (dw,))[1]
 
-    nothing = lambda tree: np.zeros(
-        (sum(int(np.size(leaf)) for leaf in jax.tree_util.tree_leaves(tree)), number), bool
-    )
-    others = [(tree, nothing(tree)) for tree in (leading, point.t, point.jets, point.args)]
-    return incidence(rate, (leading, np.eye(number, dtype=bool)), *others).depends
+    others = (leading, example.t, example.jets, example.args)
+    nothing = np.zeros(number, bool)
+    inputs = (leading, np.eye(number, dtype=bool)), *(tracked(tree, nothing) for tree in others)
+    return incidence(rate, *inputs).depends

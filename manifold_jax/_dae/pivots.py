@@ -2,15 +2,13 @@
 
 from typing import Any, Literal, NamedTuple
 
-import equinox as eqx
-import jax
 import jax.numpy as jnp
-import jax.scipy.linalg as jsl
 import numpy as np
 from jaxtyping import Array, Float
 
 from .._base.types import BoolScalar
-from .._linalg.dense import Factorization, factorize, gram, reduction, UNROLL_LIMIT
+from .._linalg.dense import Factorization, factorize, gram, UNROLL_LIMIT
+from .._linalg.pivoted import factorize_equilibrated
 from .._linalg.rows import multiply
 from .compressed import Compressed
 from .derivatives import pick
@@ -21,8 +19,8 @@ _SMALLEST_PIVOT = 1e-6
 
 
 class Elimination(NamedTuple):
-    """Which pivots are taken: `J[rows, columns]` is diagonal and constant. Of what is left the
-    symmetric part may be definite, positive or negative (`sign`), or not (0)."""
+    """Which pivots are taken: `J[rows, columns]` is diagonal and constant. What is left may be
+    symmetric and definite, positive or negative (`sign`), or not (0)."""
 
     rows: np.ndarray
     columns: np.ndarray
@@ -34,26 +32,14 @@ class Elimination(NamedTuple):
     def of(constant: np.ndarray, samples: list[np.ndarray]) -> "Elimination":
         """Choose pivots from samples of the matrix, and where it is constant."""
         rows, columns = _independent_pivots(constant, samples)
-        n = constant.shape[0]
+        n, sign = constant.shape[0], 0
         others = [np.setdiff1d(np.arange(n), taken) for taken in (rows, columns)]
-        left = [_schur_complement(J, rows, columns, *others) for J in samples]
-        for sign in (1, -1):
-            if all(_is_definite(sign * S) for S in left):
-                return Elimination(rows, columns, *others, sign)  # pyright: ignore[reportCallIssue]
-        return Elimination(rows, columns, *others, 0)  # pyright: ignore[reportCallIssue]
-
-    @property
-    def is_definite(self) -> bool:
-        """Large ones are factored by the library, which exchanges rows in any case."""
-        return self.sign != 0 and len(self.other_rows) <= UNROLL_LIMIT
-
-    def factorize(self, S: Float[Array, "k k"]) -> "Factorization | Pivoted":
-        return factorize(self.sign * S) if self.is_definite else Pivoted.of(S)  # pyright: ignore[reportReturnType]
-
-    def solve_rest(
-        self, rest: "Factorization | Pivoted", b: Float[Array, " k"]
-    ) -> Float[Array, " k"]:
-        return rest.solve(self.sign * b if self.is_definite else b)
+        # Large ones are factored by the library, which exchanges rows in any case.
+        if len(others[0]) <= UNROLL_LIMIT:
+            left = [_schur_complement(J, rows, columns, *others) for J in samples]
+            definite = [s for s in (1, -1) if all(_is_definite(s * S) for S in left)]
+            sign = definite[0] if definite else 0
+        return Elimination(rows, columns, *others, sign)  # pyright: ignore[reportCallIssue]
 
 
 def _independent_pivots(
@@ -89,7 +75,7 @@ class Eliminated(NamedTuple):
     pivots: Float[Array, " p"]
     right: Float[Array, "p k"]
     below: Float[Array, "k p"]
-    rest: "Factorization | Pivoted | None"
+    rest: Factorization | None
 
     @staticmethod
     def of(plan: Elimination, entries: Compressed, derivatives: Array) -> "Eliminated":
@@ -101,7 +87,8 @@ class Eliminated(NamedTuple):
         S = entries.block(derivatives, plan.other_rows, plan.other_columns)
         if len(plan.rows) > 0:
             S = S - gram(below, (right / pivots[:, None]).T)
-        return Eliminated(plan, pivots, right, below, plan.factorize(S))
+        rest = factorize(plan.sign * S) if plan.sign else factorize_equilibrated(S)
+        return Eliminated(plan, pivots, right, below, rest)
 
     @property
     def full_rank(self) -> BoolScalar:
@@ -114,52 +101,10 @@ class Eliminated(NamedTuple):
         order = np.argsort(np.concatenate([plan.columns, plan.other_columns]))
         if self.rest is None:
             return pick(upper / self.pivots, order)
+        if len(plan.rows) > 0:
+            lower = lower - multiply(self.below, upper / self.pivots)
+        y = self.rest.solve(plan.sign * lower if plan.sign else lower)
         if len(plan.rows) == 0:
-            y = plan.solve_rest(self.rest, lower)
             return pick(y, order)
-        lower = lower - multiply(self.below, upper / self.pivots)
-        y = plan.solve_rest(self.rest, lower)
         x = (upper - multiply(self.right, y)) / self.pivots
         return pick(jnp.concatenate([x, y]), order)
-
-
-class Pivoted(eqx.Module):
-    """Any square matrix, equilibrated and factored with row exchanges, and whether its rank was
-    full. The derivative is that of `A x = b`."""
-
-    A: Float[Array, "k k"]
-    scales: tuple[Array, Array]  # of rows and columns, held fixed
-    factors: Any
-    full_rank: BoolScalar
-
-    @staticmethod
-    def of(A: Float[Array, "k k"]) -> "Pivoted":
-        k, fixed = A.shape[0], jax.lax.stop_gradient(A)
-        one = lambda size: jnp.where(size > 0, 1 / jnp.where(size > 0, size, 1), 1)
-        rows = one(jnp.max(jnp.abs(fixed), axis=1))
-        columns = one(jnp.max(jnp.abs(fixed) * rows[:, None], axis=0))
-        scaled = fixed * rows[:, None] * columns[None, :]
-        threshold = 10 * k * float(jnp.finfo(A.dtype).eps)
-        if k <= UNROLL_LIMIT:
-            factors = reduction(scaled)[0]
-            full_rank = jnp.max(jnp.abs(factors)) * threshold < 1  # not so of NaN
-        else:
-            factors = jsl.lu_factor(scaled)
-            full_rank = jnp.all(jnp.abs(jnp.diagonal(factors[0])) > threshold)
-        return Pivoted(A, (rows, columns), factors, full_rank)
-
-    def solve(self, b: Float[Array, " k"]) -> Float[Array, " k"]:
-        A, (rows, columns), factors = self.A, self.scales, self.factors
-
-        def solve(transposed: bool, b: Array) -> Array:
-            left, right = (columns, rows) if transposed else (rows, columns)
-            if isinstance(factors, tuple):
-                return right * jsl.lu_solve(factors, left * b, trans=int(transposed))
-            return right * multiply(factors.T if transposed else factors, left * b)
-
-        return jax.lax.custom_linear_solve(
-            lambda x: multiply(A, x),
-            b,
-            lambda _, b: solve(False, b),
-            lambda _, b: solve(True, b),
-        )

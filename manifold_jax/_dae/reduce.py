@@ -1,29 +1,24 @@
 """From equations to a vector field on a manifold."""
 
 from collections.abc import Callable
-from typing import Any, get_args, Literal, NamedTuple, TypeAlias
+from typing import Any, get_args, Literal, TypeAlias
 
 import jax
 import jax.core
 import jax.flatten_util as jfu
 import jax.numpy as jnp
 import jax.tree_util as jtu
-import numpy as np
 
 from .._base.numbers import with_arrays
 from .._base.types import Args, Y
-from .aliases import Aliases, lifted
-from .combined import cancelled
-from .compressed import Compressed
-from .constraint import Reduced
-from .equations import Equations, listed
-from .highest_derivatives import Plan, Static
-from .layout import Layout
-from .occurrence import Occurrence, Point
-from .pivots import Elimination
+from .analysis import Analysis
+from .combined import without_cancellations
+from .equations import Equations, listed, Names
+from .occurrence import Example, Occurrence
+from .reduced import Reduced
 from .report import DAEReport
-from .samples import dependent_rows, Samples
-from .signature import signature, SingularParts, Structure
+from .samples import dependent_rows
+from .signature import SingularParts
 from .system import ReducedDAE
 
 
@@ -105,97 +100,20 @@ def reduce_dae(
     """
     if form not in get_args(Form):
         raise ValueError(f"`form` must be 'ode' or 'index-1', got {form!r}.")
-    implicit = form == "index-1"
     _check_concrete(x_example, args_example)
     args_example = with_arrays(args_example)  # as they will be used
     equations = Equations.of(F, x_example, args_example, order)
     x = jfu.ravel_pytree(jtu.tree_map(jnp.asarray, x_example))[0]
-    point = Point.of(equations, x, args_example)
-    found = _Analysis.of(equations, Occurrence.of(equations, point), point, implicit)
+    example = Example.of(equations, x, args_example)
+    occurrence = Occurrence.of(example)
+    found = Analysis.of(example, occurrence, form == "index-1")
     if found is None:
-        raise ValueError(_structurally_singular(equations, Occurrence.of(equations, point)))
-    found = _without_cancellations(found, point)
-    report = found.report()
+        raise ValueError(_structurally_singular(equations.names, occurrence))
+    found = without_cancellations(found)
+    report = DAEReport.of(found)
     if found.samples.singular:
         raise ValueError(_singular(found, report))
-    varies = _at(found.aliases.merged(found.occurrence.varies), found.layout.structure.sigma)
-    constant = found.layout.structure.leading & ~varies
-    elimination = Elimination.of(constant, found.samples.matrices)
-    plan = Plan(
-        found.layout, found.entries, elimination, order, found.unlifted, np.asarray(x), implicit
-    )
-    return ReducedDAE(Reduced(found.equations, Static(plan)), report)
-
-
-class _Analysis(NamedTuple):
-    """What follows from the occurrence of the unknowns."""
-
-    equations: Equations
-    occurrence: Occurrence
-    written: Structure
-    aliases: Aliases
-    unlifted: Structure
-    layout: Layout
-    entries: Compressed
-    samples: Samples
-    implicit: bool
-
-    @staticmethod
-    def of(
-        equations: Equations, occurrence: Occurrence, point: Point, implicit: bool
-    ) -> "_Analysis | None":
-        """`None` if the structure is singular."""
-        written = Structure.of(signature(occurrence.there))
-        if written is None:
-            return None
-        aliases = Aliases.of(equations, occurrence, point)
-        there = aliases.merged(occurrence.there)
-        unlifted = Structure.of(signature(there))
-        assert unlifted is not None
-        structure = unlifted if implicit else lifted(equations, aliases, unlifted, point)
-        layout = Layout.of(structure, aliases, equations.order)
-        entries = Compressed.of(structure, aliases, there, equations.order + 1)
-        samples = Samples.of(equations, layout, entries, point, implicit)
-        return _Analysis(
-            equations, occurrence, written, aliases, unlifted, layout, entries, samples, implicit
-        )
-
-    def report(self) -> DAEReport:
-        return DAEReport.of(
-            self.equations,
-            self.occurrence,
-            self.written,
-            self.unlifted,
-            self.layout,
-            self.samples,
-            self.implicit,
-        )
-
-
-def _without_cancellations(found: _Analysis, point: Point) -> _Analysis:
-    """Add combinations of equations from which derivatives are gone, as long as there are some."""
-    while found.samples.singular:
-        repairs = cancelled(
-            found.equations,
-            found.occurrence,
-            found.aliases,
-            found.layout,
-            found.samples.matrices,
-            point,
-        )
-        if not repairs:
-            return found
-        equations = found.equations
-        for repair in repairs:
-            equations = equations.combined(repair.combination)
-        occurrence = Occurrence.of(equations, point).without(
-            found.occurrence, {repair.combination.row: repair.gone for repair in repairs}
-        )
-        better = _Analysis.of(equations, occurrence, point, found.implicit)
-        if better is None:
-            return found
-        found = better
-    return found
+    return ReducedDAE(Reduced(found.example.equations, found), report)
 
 
 def _check_concrete(x: Any, args: Any) -> None:
@@ -207,8 +125,8 @@ def _check_concrete(x: Any, args: Any) -> None:
         )
 
 
-def _structurally_singular(equations: Equations, occurrence: Occurrence) -> str:
-    parts, names = SingularParts.of(occurrence.there.any(axis=1)), equations.names  # pyright: ignore[reportArgumentType]
+def _structurally_singular(names: Names, occurrence: Occurrence) -> str:
+    parts = SingularParts.of(occurrence.there.any(axis=1))  # pyright: ignore[reportArgumentType]
     named = lambda part: (
         listed([names.equations[i] for i in part[0]]),
         listed([names.unknowns[j] for j in part[1]]) or "none",
@@ -221,15 +139,9 @@ def _structurally_singular(equations: Equations, occurrence: Occurrence) -> str:
     )
 
 
-def _at(there: np.ndarray, levels: np.ndarray) -> np.ndarray:
-    """`there[i, levels[i, j], j]`."""
-    level = np.maximum(levels, 0)[:, None, :]
-    return np.take_along_axis(there, level, axis=1)[:, 0]
-
-
-def _singular(found: _Analysis, report: DAEReport) -> str:
-    rows = found.aliases.rows[dependent_rows(found.samples.matrices[0])]
-    names = listed([found.equations.names.equations[i] for i in rows])
+def _singular(found: Analysis, report: DAEReport) -> str:
+    rows = found.rows[dependent_rows(found.samples.matrices[0])]
+    names = listed([found.example.equations.names.equations[i] for i in rows])
     return (
         f"`F` is structurally regular (index {report.index}, {report.degrees_of_freedom} degrees of freedom), but the "
         f"matrix of its leading derivatives is singular wherever it was evaluated (reciprocal condition "

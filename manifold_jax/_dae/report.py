@@ -4,11 +4,9 @@ import dataclasses
 
 import numpy as np
 
-from .equations import Equations, listed
-from .layout import Layout
-from .occurrence import Occurrence
-from .samples import Samples
-from .signature import ABSENT, Structure
+from .analysis import Analysis
+from .equations import listed
+from .signature import ABSENT
 
 
 # Equations and unknowns up to which the whole signature matrix is printed.
@@ -52,21 +50,12 @@ class DAEReport:
     fallbacks: dict[str, int]
 
     @staticmethod
-    def of(
-        equations: Equations,
-        occurrence: Occurrence,
-        written: Structure,
-        unlifted: Structure,
-        layout: Layout,
-        samples: Samples,
-        implicit: bool,
-    ) -> "DAEReport":
-        names, structure = equations.names, layout.structure
-        raised = layout.aliases.roots[structure.d > unlifted.d]
-        best = max(samples.conditions)
-        states = (
-            np.concatenate([layout.names, layout.leading_names()]) if implicit else layout.names
-        )
+    def of(analysis: Analysis) -> "DAEReport":
+        names, layout, written = analysis.example.equations.names, analysis.layout, analysis.written
+        raised = layout.aliases.roots[layout.structure.d > analysis.unlifted.d]
+        best, states = max(analysis.samples.conditions), layout.names
+        if analysis.implicit:
+            states = np.concatenate([states, layout.leading_names()])
         return DAEReport(
             equations=names.equations,
             unknowns=names.unknowns,
@@ -76,11 +65,11 @@ class DAEReport:
             index=written.index,
             degrees_of_freedom=written.degrees_of_freedom,
             states=tuple(names.derivative(unknown, k) for k, unknown in states.tolist()),
-            num_constraints=int(structure.c.sum()),
+            num_constraints=int(analysis.c.sum()),
             dropped=tuple(names.equations[i] for i in layout.aliases.equations),
             lifted=tuple(names.unknowns[j] for j in raised),
             condition=1 / best if best > 0 else float("inf"),
-            fallbacks=occurrence.unknown_primitives,
+            fallbacks=analysis.occurrence.unknown_primitives,
         )
 
     def __str__(self) -> str:
@@ -108,21 +97,16 @@ class DAEReport:
 
     def _matrix(self) -> list[str]:
         """The signature matrix with the offsets beside and below it."""
-        body = [["." if s < 0 else str(s) for s in row] for row in self.sigma.tolist()]
-        table = [["", *self.unknowns, "c"]]
-        table += [
-            [name, *row, str(c)]
-            for name, row, c in zip(self.equations, body, self.c.tolist(), strict=True)
+        sigma = np.where(self.sigma < 0, ".", self.sigma.astype(str))
+        columns = [
+            [name, *entries, str(d)]
+            for name, entries, d in zip(self.unknowns, sigma.T.tolist(), self.d, strict=True)
         ]
-        table.append(["d", *map(str, self.d.tolist()), ""])
-        widths = [max(map(len, column)) for column in zip(*table, strict=True)]
-        return [
-            "  ".join(
-                cell.ljust(width) if k == 0 else cell.rjust(width)
-                for k, (cell, width) in enumerate(zip(row, widths, strict=True))
-            ).rstrip()
-            for row in table
-        ]
+        columns.append(["c", *map(str, self.c), ""])
+        first = ["", *self.equations, "d"]
+        padded = [[cell.ljust(max(map(len, first))) for cell in first]]
+        padded += [[cell.rjust(max(map(len, column))) for cell in column] for column in columns]
+        return ["  ".join(row).rstrip() for row in zip(*padded, strict=True)]
 
     def _grouped(self) -> str:
         groups: dict[int, list[str]] = {}

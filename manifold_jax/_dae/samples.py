@@ -1,19 +1,14 @@
 """The matrix of the leading derivatives at a few points: is it regular?"""
 
+from collections.abc import Callable
 from typing import NamedTuple
 
-import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from .compressed import Compressed
-from .equations import Equations
-from .highest_derivatives import HighestDerivatives, Plan, Static
 from .layout import Layout
-from .occurrence import Point
-from .pivots import Elimination
+from .occurrence import Example
 
 
 # How far from the example, relative and absolute: where the equations are not defined, nearer.
@@ -31,26 +26,11 @@ class Samples(NamedTuple):
         return max(self.conditions) < singular_below(self.matrices[0].dtype)
 
     @staticmethod
-    def of(
-        equations: Equations, layout: Layout, entries: Compressed, point: Point, implicit: bool
-    ) -> "Samples":
-        """`implicit`: the matrix may depend on the leading derivatives."""
-        nothing = np.zeros(0, int)
-        elimination = Elimination(*[nothing] * 4, 0)  # pyright: ignore[reportCallIssue]
-        example = np.asarray(point.jets[0])
-        plan = Plan(
-            layout, entries, elimination, equations.order, layout.structure, example, implicit
-        )
-        static = Static(plan)
-
-        @jax.jit
-        def matrix(t: Array, y: Array, args: object) -> Array:
-            args, states = eqx.combine(args, point.fixed_args), layout.num_states
-            return HighestDerivatives(equations, t, y[:states], args, static).matrix(y[states:])
-
+    def of(matrix: Callable, example: Example, layout: Layout) -> "Samples":
+        """`matrix(t, y, args)`, of the states and the leading derivatives behind them."""
         matrices = []
-        for t, y in _points(layout, np.asarray(point.jets[0])):
-            sample = np.asarray(matrix(t, jnp.asarray(y), point.args))
+        for t, y in _points(layout, np.asarray(example.jets[0])):
+            sample = np.asarray(matrix(t, jnp.asarray(y), example.args))
             if np.isfinite(sample).all():
                 matrices.append(sample)
         if not matrices:

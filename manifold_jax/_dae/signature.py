@@ -67,9 +67,8 @@ def signature(occurs: np.ndarray) -> np.ndarray:
 
 class SingularParts(NamedTuple):
     """The parts of a matrix without a transversal (Dulmage & Mendelsohn, Canad. J. Math. 10 (1958)
-    517-534):
-    the equations that have too few unknowns for all of them, and those unknowns; the unknowns that
-    too few equations are left for, and those equations."""
+    517-534): the equations that have too few unknowns for all of them, and those unknowns; the
+    unknowns that too few equations are left for, and those equations."""
 
     overdetermined: tuple[np.ndarray, np.ndarray]  # equations, unknowns
     underdetermined: tuple[np.ndarray, np.ndarray]

@@ -4,15 +4,15 @@ from typing import Any
 
 import diffrax as dfx
 import equinox as eqx
+import numpy as np
 from jaxtyping import Array, Float
 
 from .._base.numbers import numbers_as_arrays
 from .._base.types import Args, RealScalarLike, Y
 from .._constraint.projection_info import ProjectionInfo
 from .._rosenbrock import MassMatrixTerm
-from .constraint import rate, Reduced, ReducedConstraint, unknowns_with_derivatives
-from .implicit import implicit_field, mass
 from .initial import consistent_state, Guess
+from .reduced import Reduced, ReducedConstraint
 from .report import DAEReport
 
 
@@ -27,9 +27,11 @@ class ReducedDAE(eqx.Module):
     def terms(self) -> dfx.ODETerm | MassMatrixTerm:
         """The vector field on the state, a Diffrax term; NaN where the equations do not determine
         it. With `form="index-1"` a [`MassMatrixTerm`][] for [`Rodas5P`][] and [`Rodas3P`][]."""
-        if self.system.static.plan.implicit:
-            return MassMatrixTerm(self._implicit_field, mass(self.system.static.plan.layout))
-        return dfx.ODETerm(self._field)
+        analysis = self.system.analysis
+        if not analysis.implicit:
+            return dfx.ODETerm(self.system.field)
+        numbers = [analysis.layout.num_states, len(analysis.c)]
+        return MassMatrixTerm(self.system.field, np.repeat([1.0, 0.0], numbers))
 
     @property
     def constraint(self) -> ReducedConstraint:
@@ -86,21 +88,12 @@ class ReducedDAE(eqx.Module):
         Of one state; `jax.vmap(dae.outputs, in_axes=(0, 0, None))` of saved ones. Derivatives that
         are not in the equations are found by differentiating along the solution.
         """
-        self.system.check(z)
         return _outputs(self.system, t, z, args)
-
-    def _field(self, t: RealScalarLike, y: Float[Array, " states"], args: Args) -> Array:
-        self.system.check(y)
-        return rate(self.system, t, y, args)
-
-    def _implicit_field(self, t: RealScalarLike, y: Float[Array, " states"], args: Args) -> Array:
-        self.system.check(y)
-        return implicit_field(self.system, t, y, args)
 
 
 @numbers_as_arrays("args", times=("t",))
 @eqx.filter_jit
 def _outputs(system: Reduced, t: RealScalarLike, z: Array, args: Args) -> tuple[Any, ...]:
     """Compiled also where it is called alone: one by one, its operations take ten times as long."""
-    found = unknowns_with_derivatives(system, t, z, args, system.equations.order)
+    found = system.unknowns_with_derivatives(t, z, args, system.equations.order)
     return tuple(system.equations.unravel(x) for x in found)

@@ -5,6 +5,7 @@ mechanism and cannot be fused across a batch. Up to `UNROLL_LIMIT` rows the elim
 is therefore written out entry by entry; beyond that the library routine is used.
 """
 
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -21,77 +22,81 @@ from .._base.types import BoolScalar, FloatScalar
 # Number of operations grows like m^3 / 3: 170 at m = 8, still less than one library call.
 UNROLL_LIMIT = 8
 
-# Columns up to which an elimination with row exchanges is written out.
-_UNROLLED_COLUMNS = 4
-
 
 class Factorization(eqx.Module):
-    """`A = L U` of a square matrix, with a flag that says whether its rank was full.
+    """A square matrix, the factors with which its systems are solved, and whether its rank was full.
 
-    Without pivoting when unrolled: the matrices met here are `G V` with `V` close to
-    `W^-1 G^T`, or mass matrices, hence close to symmetric positive definite. Where the rank
-    is not full the solution is finite but meaningless: its derivative must not be NaN, as
+    Where it was not the solution is finite but meaningless: its derivative must not be NaN, as
     the zero cotangent of a rejected step would turn into NaN, too.
 
     The derivative is that of `A x = b`, not of the elimination: five times less to compile.
     """
 
     A: Float[Array, "m m"]
-    lu: list[list[Float[Array, ""]]] | tuple[Float[Array, "m m"], Array]  # held fixed
+    factors: Any  # with `solve` and `solve_transposed`, held fixed
     full_rank: BoolScalar
+    product: Callable = eqx.field(static=True)  # of `A` and what it is solved for
 
     def solve(self, b: Float[Array, "m ..."]) -> Float[Array, "m ..."]:
-        A, lu = self.A, self.lu
         return jax.lax.custom_linear_solve(
-            lambda x: _product(A, x),
+            lambda x: self.product(self.A, x),
             b,
-            lambda _, b: _substitute(lu, b),
-            lambda _, b: _substitute_transposed(lu, b),
+            lambda _, b: self.factors.solve(b),
+            lambda _, b: self.factors.solve_transposed(b),
         )
 
 
-def _substitute(lu: Any, b: Float[Array, "m ..."]) -> Float[Array, "m ..."]:
-    """`(L U)^-1 b`."""
-    if not isinstance(lu, list):
-        return jsl.lu_solve(lu, b)
-    m = len(lu)
-    x = [b[i] for i in range(m)]
-    for i in range(m):
-        for k in range(i):
-            x[i] = x[i] - lu[i][k] * x[k]
-    for i in reversed(range(m)):
-        for k in range(i + 1, m):
-            x[i] = x[i] - lu[i][k] * x[k]
-        x[i] = x[i] / lu[i][i]
-    return jnp.stack(x)
+class WrittenOut(eqx.Module):
+    """`A = L U` entry by entry, `L` with a unit diagonal below `U`."""
+
+    lu: list[list[FloatScalar]]
+
+    def solve(self, b: Float[Array, "m ..."]) -> Float[Array, "m ..."]:
+        lu, m = self.lu, len(self.lu)
+        x = [b[i] for i in range(m)]
+        for i in range(m):
+            for k in range(i):
+                x[i] = x[i] - lu[i][k] * x[k]
+        for i in reversed(range(m)):
+            for k in range(i + 1, m):
+                x[i] = x[i] - lu[i][k] * x[k]
+            x[i] = x[i] / lu[i][i]
+        return jnp.stack(x)
+
+    def solve_transposed(self, b: Float[Array, "m ..."]) -> Float[Array, "m ..."]:
+        lu, m = self.lu, len(self.lu)
+        x = [b[i] for i in range(m)]
+        for i in range(m):
+            for k in range(i):
+                x[i] = x[i] - lu[k][i] * x[k]
+            x[i] = x[i] / lu[i][i]
+        for i in reversed(range(m)):
+            for k in range(i + 1, m):
+                x[i] = x[i] - lu[k][i] * x[k]
+        return jnp.stack(x)
 
 
-def _substitute_transposed(lu: Any, b: Float[Array, "m ..."]) -> Float[Array, "m ..."]:
-    """`(U^T L^T)^-1 b`."""
-    if not isinstance(lu, list):
-        return jsl.lu_solve(lu, b, trans=1)
-    m = len(lu)
-    x = [b[i] for i in range(m)]
-    for i in range(m):
-        for k in range(i):
-            x[i] = x[i] - lu[k][i] * x[k]
-        x[i] = x[i] / lu[i][i]
-    for i in reversed(range(m)):
-        for k in range(i + 1, m):
-            x[i] = x[i] - lu[k][i] * x[k]
-    return jnp.stack(x)
+class Library(eqx.Module):
+    """`A = L U` with row exchanges, by LAPACK or cuSOLVER."""
+
+    lu: tuple[Float[Array, "m m"], Array]
+
+    def solve(self, b: Float[Array, "m ..."]) -> Float[Array, "m ..."]:
+        return jsl.lu_solve(self.lu, b)
+
+    def solve_transposed(self, b: Float[Array, "m ..."]) -> Float[Array, "m ..."]:
+        return jsl.lu_solve(self.lu, b, trans=1)
 
 
 class Inverse(eqx.Module):
-    """`A^-1` by Gauss-Jordan elimination without pivoting, the whole matrix in one array: fewer and
-    larger operations than those of [`Factorization`][], of which a program is compiled in less
-    time. For what is evaluated once in a step; at stages the elimination is faster."""
+    """The inverse of a matrix, or its pseudo-inverse."""
 
     inverse: Float[Array, "m m"]
     full_rank: BoolScalar
+    product: Callable = eqx.field(static=True)
 
     def solve(self, b: Float[Array, "m ..."]) -> Float[Array, "m ..."]:
-        return _product(self.inverse, b)
+        return self.product(self.inverse, b)
 
 
 # Rows from which on the inverse pays.
@@ -99,10 +104,15 @@ _SMALLEST_INVERSE = 3
 
 
 def factorize_once(A: Float[Array, "m m"]) -> "Factorization | Inverse":
-    """Factor a matrix, for what is evaluated once in a step, or in a solve."""
+    """Factor a matrix, for what is evaluated once in a step, or in a solve.
+
+    Small ones by Gauss-Jordan elimination without pivoting, the whole matrix in one array: fewer and
+    larger operations than those of [`factorize`][], of which a program is compiled in less time. At
+    stages that elimination is faster.
+    """
     if not _SMALLEST_INVERSE <= A.shape[0] <= UNROLL_LIMIT:
-        return factorize(A)  # pyright: ignore[reportReturnType]
-    return Inverse(*_invert(A))
+        return factorize(A)
+    return Inverse(*_invert(A), _product)
 
 
 @jax.custom_jvp
@@ -112,7 +122,7 @@ def _invert(A: Float[Array, "m m"]) -> tuple[Float[Array, "m m"], BoolScalar]:
     rows, diagonal = jnp.arange(m), jnp.abs(jnp.diagonal(A))
     full_rank = jnp.asarray(True)
     for k in range(m):
-        accepted = A[k, k] > _threshold(A) * diagonal[k]
+        accepted = A[k, k] > rank_threshold(A) * diagonal[k]
         full_rank &= accepted
         row = jnp.where(rows == k, 1, A[k]) / jnp.where(accepted, A[k, k], 1)
         others = jnp.where((rows == k)[None, :], 0, A) - A[:, k][:, None] * row[None, :]
@@ -128,7 +138,8 @@ def _invert_jvp(primals, tangents):
     return (X, full_rank), (-_product(_product(X, A_dot), X), no_tangent)
 
 
-def _threshold(A: Float[Array, "m m"]) -> float:
+def rank_threshold(A: Float[Array, "m m"]) -> float:
+    """What pivots of an equilibrated matrix of full rank exceed."""
     return 10 * A.shape[0] * float(jnp.finfo(A.dtype).eps)
 
 
@@ -139,43 +150,31 @@ def _product(A: Float[Array, "i j"], B: Float[Array, "j ..."]) -> Float[Array, "
     return jnp.sum(A.reshape(*A.shape, *(1,) * (B.ndim - 1)) * B[None], axis=1)
 
 
-class PseudoInverse(eqx.Module):
-    """`A^+`: for equations that depend on each other the solution of least norm, where the matrix is
-    equilibrated with each unknown multiplied by the square root of its diagonal entry.
+def factorize(A: Float[Array, "m m"]) -> Factorization:
+    """Factor a regular matrix.
 
-    Its derivative is that at constant rank (Golub & Pereyra 1973).
-    """
-
-    inverse: Float[Array, "m m"]
-    full_rank: BoolScalar  # not asked for: only whether the matrix was finite
-
-    def solve(self, b: Float[Array, "m ..."]) -> Float[Array, "m ..."]:
-        return self.inverse @ b
-
-
-def factorize(A: Float[Array, "m m"], redundant: bool = False) -> Factorization | PseudoInverse:
-    """Factor `A`, symmetric positive semidefinite if `redundant`.
+    Small ones without pivoting: the matrices met here are `G V` with `V` close to `W^-1 G^T`, or mass
+    matrices, hence close to symmetric positive definite.
 
     The rank counts as full when every pivot exceeds `10 m eps` times its diagonal entry: for a
     Gram matrix `A = G W^-1 G^T` that ratio is the squared sine of the angle between
     one row of `G` and the span of those before it, and rounding leaves about `eps` of it.
     """
-    if redundant:
-        return pseudo_invert(A, equilibrated=True)
     m, fixed = A.shape[0], jax.lax.stop_gradient(A)
     if m > UNROLL_LIMIT:
-        return _factorize_with_library(A)
+        pivots = jnp.diagonal(jsl.lu_factor(_equilibrated(A))[0])
+        return _factorize_by_library(A, jnp.all(jnp.abs(pivots) > rank_threshold(A)))
     lu = [[fixed[i, j] for j in range(m)] for i in range(m)]
     full_rank = jnp.asarray(True)
     for k in range(m):
-        accepted = lu[k][k] > _threshold(A) * jnp.abs(fixed[k, k])
+        accepted = lu[k][k] > rank_threshold(A) * jnp.abs(fixed[k, k])
         full_rank &= accepted
         lu[k][k] = jnp.where(accepted, lu[k][k], 1)
         for i in range(k + 1, m):
             lu[i][k] = lu[i][k] / lu[k][k]
             for j in range(k + 1, m):
                 lu[i][j] = lu[i][j] - lu[i][k] * lu[k][j]
-    return Factorization(A, lu, full_rank)
+    return Factorization(A, WrittenOut(lu), full_rank, _product)
 
 
 # Equations that depend on each other on the manifold do so only nearly at a stage off it:
@@ -183,29 +182,25 @@ def factorize(A: Float[Array, "m m"], redundant: bool = False) -> Factorization 
 _DEPENDENT = 1e-4
 
 
-def pseudo_invert(
-    A: Float[Array, "m m"], *, equilibrated: bool = False, dependent: Any = _DEPENDENT
-) -> PseudoInverse:
-    """Return the pseudo-inverse of a symmetric positive semidefinite matrix; `equilibrated` with
-    its diagonal scaled to one,
-    so that the units of equations do not decide which of them depend on others. Eigenvalues below
-    `dependent` times the largest count as zero."""
+def pseudo_invert(A: Float[Array, "m m"], dependent: Any = _DEPENDENT) -> Inverse:
+    """Return `A^+` of a symmetric positive semidefinite matrix with its diagonal scaled to one, so
+    that the units of equations do not decide which of them depend on others: for such equations the
+    solution of least norm, each unknown multiplied by the square root of its diagonal entry.
+    Eigenvalues below `dependent` times the largest count as zero. In the place of a full rank, which
+    is not asked for, it says whether the matrix was finite."""
     finite = jnp.all(jnp.isfinite(A))
     A = jnp.where(finite, A, jnp.eye(A.shape[0], dtype=A.dtype))
-    scale = jnp.ones_like(A)
-    if equilibrated:
-        diagonal = jax.lax.stop_gradient(jnp.diagonal(A))
-        size = jnp.where(diagonal > 0, 1 / jnp.sqrt(jnp.where(diagonal > 0, diagonal, 1)), 1)
-        scale = size[:, None] * size[None, :]
+    diagonal = jax.lax.stop_gradient(jnp.diagonal(A))
+    size = jnp.where(diagonal > 0, 1 / jnp.sqrt(jnp.where(diagonal > 0, diagonal, 1)), 1)
+    scale = size[:, None] * size[None, :]
     dependent = jax.lax.stop_gradient(jnp.asarray(dependent, A.dtype))
-    return PseudoInverse(scale * _pseudo_inverse(scale * A, dependent), finite)
+    return Inverse(scale * _pseudo_inverse(scale * A, dependent), finite, jnp.matmul)
 
 
 @ForwardRule
 def _pseudo_inverse(A: Float[Array, "m m"], dependent: FloatScalar) -> Float[Array, "m m"]:
     """Return the pseudo-inverse of a symmetric matrix. (The derivative of `jnp.linalg.pinv` cannot
-    be differentiated again
-    where `rtol` is an array.)"""
+    be differentiated again where `rtol` is an array.)"""
     values, V = jnp.linalg.eigh(A, symmetrize_input=False)
     used = jnp.abs(values) > dependent * jnp.max(jnp.abs(values))
     return (V * jnp.where(used, 1 / jnp.where(used, values, 1), 0)[None, :]) @ V.T
@@ -220,12 +215,24 @@ def _pseudo_inverse_jvp(P, primals, tangents):
     return turned + turned.T - P @ A_dot @ P
 
 
-def _factorize_with_library(A: Float[Array, "m m"]) -> Factorization:
+def factorize_positive(A: Float[Array, "m m"]) -> Factorization:
+    """Factor a symmetric matrix, whose rank counts as full if it is positive definite."""
+    if A.shape[0] <= UNROLL_LIMIT:
+        return factorize(A)  # which wants positive pivots
+    lower = jnp.linalg.cholesky(_equilibrated(A))
+    positive = jnp.all(jnp.diagonal(lower) ** 2 > rank_threshold(A))  # NaN unless positive definite
+    return _factorize_by_library(A, positive)
+
+
+def _equilibrated(A: Float[Array, "m m"]) -> Float[Array, "m m"]:
     size = jnp.sqrt(jnp.maximum(jnp.abs(jnp.diagonal(A)), jnp.finfo(A.dtype).tiny))
-    equilibrated, _ = jsl.lu_factor(jax.lax.stop_gradient(A / size[:, None] / size[None, :]))
-    full_rank = jnp.all(jnp.abs(jnp.diagonal(equilibrated)) > _threshold(A))
+    return jax.lax.stop_gradient(A / size[:, None] / size[None, :])
+
+
+def _factorize_by_library(A: Float[Array, "m m"], full_rank: BoolScalar) -> Factorization:
     A = jnp.where(full_rank, A, jnp.eye(A.shape[0], dtype=A.dtype))
-    return Factorization(A, jsl.lu_factor(jax.lax.stop_gradient(A)), full_rank)
+    factors = Library(jsl.lu_factor(jax.lax.stop_gradient(A)))
+    return Factorization(A, factors, full_rank, _product)
 
 
 def gram(A: Float[Array, "i n"], B: Float[Array, "k n"]) -> Float[Array, "i k"]:
@@ -241,44 +248,3 @@ def gram_written_out(A: Float[Array, "i n"], B: Float[Array, "k n"]) -> Float[Ar
     if max(*A.shape, B.shape[0]) > UNROLL_LIMIT:
         return gram(A, B)
     return sum(A[:, None, j] * B[None, :, j] for j in range(A.shape[1]))  # pyright: ignore[reportReturnType]
-
-
-class Elimination(eqx.Module):
-    """`A^-1` of any regular square matrix, by elimination with row exchanges. Not finite if `A` is
-    singular."""
-
-    A: Float[Array, "n n"]
-
-    def solve(self, b: Float[Array, "n ..."]) -> Float[Array, "n ..."]:
-        A = self.A
-        return jax.lax.custom_linear_solve(
-            lambda x: A @ x,
-            b,
-            lambda _, b: reduction(A)[0] @ b,
-            lambda _, b: reduction(A)[0].T @ b,
-        )
-
-
-def reduction(A: Float[Array, "n k"]) -> tuple[Float[Array, "n n"], FloatScalar]:
-    """`E` with `E A = 1` (or `[1; 0]` if `k < n`) and the sign of `det E`, by Gauss-Jordan
-    elimination with row exchanges. Not finite if the columns of `A` are dependent.
-
-    Without LAPACK: batched factorizations can wait for each other for ever on the CPU. Seen with
-    jaxlib 0.10.2 on two cores: two that do not depend on each other, under `vmap` in one large
-    program, each held a thread of XLA's pool and waited there for tasks in the queue of the pool.
-    """
-    n, k = A.shape
-    rows = jnp.arange(n)
-
-    def column(j, state):
-        M, sign = state
-        p = jnp.argmax(jnp.where(rows >= j, jnp.abs(M[:, j]), -1))
-        sign = sign * jnp.sign(M[p, j]) * jnp.where(p == j, 1, -1)
-        pivot_row = M[p] / M[p, j]
-        M = jnp.where((rows == p)[:, None], M[j][None], M)
-        M = jnp.where((rows == j)[:, None], pivot_row[None], M - jnp.outer(M[:, j], pivot_row))
-        return M, sign
-
-    start = jnp.concatenate([A, jnp.eye(n, dtype=A.dtype)], axis=1), jnp.ones((), A.dtype)
-    M, sign = jax.lax.fori_loop(0, k, column, start, unroll=k <= _UNROLLED_COLUMNS)
-    return M[:, k:], sign

@@ -15,6 +15,8 @@ from jaxtyping import Array, Float
 
 from .._base.derivative_rule import ForwardRule
 from .._base.types import BoolScalar, FloatScalar, IntScalar
+from .dense import Factorization
+from .pivoted import factorize_equilibrated
 
 
 @runtime_checkable
@@ -40,6 +42,24 @@ class AbstractEquations(eqx.Module):
         """The derivative of the residual with respect to the unknowns, at a point."""
 
 
+class SquareSystem(AbstractEquations):
+    """`function(z) = 0` of vectors, with its matrix `dr/dz` if there is a shorter way to it. Both are
+    pytrees of all that they depend on."""
+
+    function: Callable
+    matrix: Callable | None = None
+
+    def point(self, z: Float[Array, " m"]) -> Float[Array, " m"]:
+        return z
+
+    def residual(self, x: Float[Array, " m"]) -> Float[Array, " m"]:
+        return self.function(x)
+
+    def linearize(self, x: Float[Array, " m"]) -> Factorization:
+        matrix = jax.jacfwd(self.function) if self.matrix is None else self.matrix
+        return factorize_equilibrated(matrix(x))
+
+
 class Iterate(NamedTuple):
     """Unknowns, their residual, its largest scaled component, and how it went."""
 
@@ -55,9 +75,6 @@ class _Search(NamedTuple):
 
     equations: AbstractEquations
     scale: Float[Array, " m"]
-
-    def start(self, z: Float[Array, " m"], r: Float[Array, " m"]) -> Iterate:
-        return Iterate(z, r, self.level(r), jnp.zeros((), jnp.int32), jnp.asarray(True))
 
     def at(self, z: Float[Array, " m"]) -> tuple[Float[Array, " m"], FloatScalar]:
         r = self.equations.residual(self.equations.point(z))
@@ -140,18 +157,21 @@ def damped_newton(
         s = search.lowered(s, damping * dz)
         return s, jnp.where(s.progress, jnp.ones_like(damping), damping / 4)
 
-    start = search.start(z, r)
+    start = Iterate(z, r, search.level(r), jnp.zeros((), jnp.int32), jnp.asarray(True))
     return jax.lax.while_loop(unfinished, advance, (start, jnp.ones_like(start.level)))[0]
 
 
 def find_root(
-    equations: AbstractEquations, guess: Float[Array, " n"], max_steps: int = 50
-) -> Float[Array, " n"]:
-    """Iterate for as long as every step lowers `max_i |r_i|`: the best point found. Simple roots
-    are found
-    to round-off."""
+    equations: AbstractEquations,
+    guess: Float[Array, " m"],
+    max_steps: int = 50,
+    tolerance: Any = jnp.inf,
+) -> Float[Array, " m"]:
+    """The best unknowns found, by `max_i |r_i|`, without their derivative. Simple roots are found
+    to round-off. Ends where no step lowers a residual that is below the tolerance."""
+    equations, guess = without_derivative((equations, guess))
     r = equations.residual(equations.point(guess))
-    return damped_newton(equations, guess, r, jnp.ones_like(r), max_steps, jnp.inf).z
+    return damped_newton(equations, guess, r, jnp.ones_like(r), max_steps, tolerance).z
 
 
 class ImplicitTangent(NamedTuple):

@@ -1,5 +1,6 @@
 """Linear systems with any regular matrix, factored once and solved for several right-hand sides."""
 
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -9,13 +10,17 @@ import jax.scipy.linalg as jsl
 from jaxtyping import Array, Float
 
 from .._base.types import BoolScalar, FloatScalar
-from .rows import combine
+from .dense import Factorization, Library, rank_threshold, UNROLL_LIMIT
+from .rows import combine, multiply
 
 
 # Rows up to which an elimination is written out entry by entry, for XLA to fuse it with the stages. A
 # step of Rodas5P for three (four) numbers then takes 0.2 (0.3) of the time with LAPACK, in batches
 # too; for six 1.4 times as long, and it compiles in twice the time. jaxlib 0.10.2.
 LARGEST_WRITTEN_OUT = 4
+
+# Columns up to which the elimination of a whole array is.
+_UNROLLED_COLUMNS = 4
 
 
 class UnrolledElimination(eqx.Module):
@@ -43,46 +48,13 @@ class UnrolledElimination(eqx.Module):
         return combine(jnp.stack(x), self.E)
 
 
-class Library(eqx.Module):
-    """An LU factorization by LAPACK."""
-
-    lu: tuple[Float[Array, "n n"], Array]
-
-    def solve(self, b: Float[Array, " n"]) -> Float[Array, " n"]:
-        return jsl.lu_solve(self.lu, b)
-
-    def solve_transposed(self, b: Float[Array, " n"]) -> Float[Array, " n"]:
-        return jsl.lu_solve(self.lu, b, trans=1)
-
-
-class PivotedFactorization(eqx.Module):
-    """`A^-1` by elimination with row exchanges.
-
-    Where `A` is singular or not finite (`regular` is false) the solution is finite but meaningless:
-    its derivative must not be NaN, as the zero cotangent of a rejected step would turn into NaN.
-    The derivative is that of `A x = b`, not of the elimination.
-    """
-
-    A: Float[Array, "n n"]
-    held: UnrolledElimination | Library  # fixed
-    regular: BoolScalar
-
-    def solve(self, b: Float[Array, " n"]) -> Float[Array, " n"]:
-        A, held = self.A, self.held
-        return jax.lax.custom_linear_solve(
-            lambda x: combine(x, A.T),
-            b,
-            lambda _, b: held.solve(b),
-            lambda _, b: held.solve_transposed(b),
-        )
-
-
 def factorize_pivoted(
     A: Float[Array, "n n"], largest_written_out: int = LARGEST_WRITTEN_OUT
-) -> PivotedFactorization:
-    n, eye = A.shape[0], jnp.eye(A.shape[0], dtype=A.dtype)
-    held, regular = (_eliminate if n <= largest_written_out else _lapack)(jax.lax.stop_gradient(A))
-    return PivotedFactorization(jnp.where(regular, A, eye), held, regular)
+) -> Factorization:
+    """Factor any matrix with row exchanges; one that is singular or not finite is replaced."""
+    fixed, eye = jax.lax.stop_gradient(A), jnp.eye(A.shape[0], dtype=A.dtype)
+    factors, regular = (_eliminate if A.shape[0] <= largest_written_out else _lapack)(fixed)
+    return Factorization(jnp.where(regular, A, eye), factors, regular, multiply)
 
 
 def _lapack(A: Float[Array, "n n"]) -> tuple[Library, BoolScalar]:
@@ -118,3 +90,78 @@ def _eliminate(A: Float[Array, "n n"]) -> tuple[UnrolledElimination, BoolScalar]
     U = [[jnp.where(regular, rows[i][j], float(i == j)) for j in range(n)] for i in range(n)]
     E = jnp.where(regular, jnp.stack([jnp.stack(row[n:]) for row in rows]), eye)
     return UnrolledElimination(U, E), regular
+
+
+class InverseFactor(eqx.Module):
+    """`A^-1` itself."""
+
+    inverse: Float[Array, "n n"]
+    product: Callable = eqx.field(static=True)
+
+    def solve(self, b: Float[Array, " n"]) -> Float[Array, " n"]:
+        return self.product(self.inverse, b)
+
+    def solve_transposed(self, b: Float[Array, " n"]) -> Float[Array, " n"]:
+        return self.product(self.inverse.T, b)
+
+
+class Equilibrated(eqx.Module):
+    """The factors of `A` with rows and columns that were multiplied by these numbers."""
+
+    rows: Float[Array, " n"]
+    columns: Float[Array, " n"]
+    factors: InverseFactor | Library
+
+    def solve(self, b: Float[Array, " n"]) -> Float[Array, " n"]:
+        return self.columns * self.factors.solve(self.rows * b)
+
+    def solve_transposed(self, b: Float[Array, " n"]) -> Float[Array, " n"]:
+        return self.rows * self.factors.solve_transposed(self.columns * b)
+
+
+def factorize_equilibrated(A: Float[Array, "n n"]) -> Factorization:
+    """Factor any matrix with row exchanges, whatever the units of equations and unknowns. Where its
+    rank is not full solutions need not be finite."""
+    fixed, threshold = jax.lax.stop_gradient(A), rank_threshold(A)
+    one = lambda size: jnp.where(size > 0, 1 / jnp.where(size > 0, size, 1), 1)
+    rows = one(jnp.max(jnp.abs(fixed), axis=1))
+    columns = one(jnp.max(jnp.abs(fixed) * rows[:, None], axis=0))
+    scaled = fixed * rows[:, None] * columns[None, :]
+    if A.shape[0] <= UNROLL_LIMIT:
+        factors = InverseFactor(reduction(scaled)[0], multiply)
+        full_rank = jnp.max(jnp.abs(factors.inverse)) * threshold < 1  # not so of NaN
+    else:
+        factors = Library(jsl.lu_factor(scaled))
+        full_rank = jnp.all(jnp.abs(jnp.diagonal(factors.lu[0])) > threshold)
+    return Factorization(A, Equilibrated(rows, columns, factors), full_rank, multiply)
+
+
+def factorize_by_reduction(A: Float[Array, "n n"]) -> Factorization:
+    """Factor any matrix with row exchanges, without LAPACK. Not finite if it is singular."""
+    E, _ = reduction(jax.lax.stop_gradient(A))
+    return Factorization(A, InverseFactor(E, jnp.matmul), jnp.all(jnp.isfinite(E)), jnp.matmul)
+
+
+def reduction(A: Float[Array, "n k"]) -> tuple[Float[Array, "n n"], FloatScalar]:
+    """`E` with `E A = 1` (or `[1; 0]` if `k < n`) and the sign of `det E`, by Gauss-Jordan
+    elimination with row exchanges. Not finite if the columns of `A` are dependent.
+
+    Without LAPACK: batched factorizations can wait for each other for ever on the CPU. Seen with
+    jaxlib 0.10.2 on two cores: two that do not depend on each other, under `vmap` in one large
+    program, each held a thread of XLA's pool and waited there for tasks in the queue of the pool.
+    """
+    n, k = A.shape
+    rows = jnp.arange(n)
+
+    def column(j, state):
+        M, sign = state
+        p = jnp.argmax(jnp.where(rows >= j, jnp.abs(M[:, j]), -1))
+        sign = sign * jnp.sign(M[p, j]) * jnp.where(p == j, 1, -1)
+        pivot_row = M[p] / M[p, j]
+        M = jnp.where((rows == p)[:, None], M[j][None], M)
+        M = jnp.where((rows == j)[:, None], pivot_row[None], M - jnp.outer(M[:, j], pivot_row))
+        return M, sign
+
+    start = jnp.concatenate([A, jnp.eye(n, dtype=A.dtype)], axis=1), jnp.ones((), A.dtype)
+    M, sign = jax.lax.fori_loop(0, k, column, start, unroll=k <= _UNROLLED_COLUMNS)
+    return M[:, k:], sign

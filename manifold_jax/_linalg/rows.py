@@ -1,13 +1,20 @@
 """Rows of a matrix: an array, or products with them alone."""
 
 import abc
-from typing import Any, TYPE_CHECKING, TypeAlias
+from typing import Any, Protocol, runtime_checkable, TYPE_CHECKING, TypeAlias
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .dense import gram, UNROLL_LIMIT
+
+
+@runtime_checkable
+class Metric(Protocol):
+    """A symmetric matrix `W` that can be solved with."""
+
+    def solve(self, rows: Float[Array, "*k n"]) -> Float[Array, "*k n"]: ...
 
 
 class AbstractRows(eqx.Module):
@@ -24,6 +31,10 @@ class AbstractRows(eqx.Module):
     @abc.abstractmethod
     def sizes(self, scale: Float[Array, " n"]) -> Float[Array, " m"]:
         """`max_j |C_ij| scale_j` with positive scales."""
+
+    @abc.abstractmethod
+    def along(self, metric: Metric) -> "AbstractRows":
+        """`C W^-1`."""
 
     @abc.abstractmethod
     def factorize(self, directions: "AbstractRows", checked: bool = True) -> Any:
@@ -50,6 +61,11 @@ else:
     Rows: TypeAlias = Float[Array, "_ _"] | AbstractRows
 
 
+def directions_of(metric: Metric, C: Rows) -> Rows:
+    """The rows of `V^T = C W^-1`."""
+    return C.along(metric) if isinstance(C, AbstractRows) else metric.solve(C)
+
+
 def combine(weights: Float[Array, " m"], rows: Rows) -> Float[Array, " n"]:
     """`sum_i weights_i rows_i`."""
     if isinstance(rows, AbstractRows):
@@ -66,3 +82,12 @@ def multiply(A: Rows, x: Float[Array, " n"]) -> Float[Array, " m"]:
     if A.shape[1] > UNROLL_LIMIT:
         return gram(A, x[None, :])[:, 0]
     return combine(x, A.T)
+
+
+def product(M: Float[Array, "..."], v: Float[Array, " n"]) -> Float[Array, " n"]:
+    """`M v` of a scalar, a diagonal, a matrix, or of the blocks `(b, d, d)` on its diagonal."""
+    if M.ndim < 2:
+        return M * v
+    if M.ndim == 2:
+        return multiply(M, v)
+    return jnp.sum(M * v.reshape(M.shape[0], 1, -1), axis=-1).reshape(-1)

@@ -3,10 +3,10 @@
 import dataclasses
 from typing import Any
 
-import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, Float
 
+from .._base.shapes import shapes
 from .._base.types import Args, RealScalarLike, Y
 from .._constraint.constraint import AbstractConstraint
 from .._constraint.correction import ConstraintNormals
@@ -20,8 +20,8 @@ class ExtendedConstraint(AbstractConstraint):
     """The constraints of a [`MechanicalSystem`][] on its state `(q, v, z)`: those of the motion
     `(q, v)`, and of the auxiliary states `z` alone, if they have any.
 
-    Built by `MechanicalSystem.constraint`. Both are corrected by themselves. ConstraintNormals are those of
-    the motion: in local coordinates `z` is corrected along its own.
+    Built by `MechanicalSystem.constraint`. Both are corrected by themselves. ConstraintNormals are
+    those of the motion: in local coordinates `z` is corrected along its own.
     """
 
     motion: MechanicalConstraint
@@ -76,18 +76,10 @@ def split(y: Y) -> tuple[tuple[Y, Y], Y]:
     if not (isinstance(y, tuple) and len(y) == 3):
         raise ValueError(
             "`y` must be the tuple `(q, v, z)` of positions, velocities and the auxiliary states of a mechanical "
-            f"system with `auxiliary`, got shapes {jtu.tree_map(jnp.shape, y)}. Write e.g. `y0 = (q0, jnp.zeros_like(q0), z0)`."
+            f"system with `auxiliary`, got shapes {shapes(y)}. Write e.g. `y0 = (q0, jnp.zeros_like(q0), z0)`."
         )
     q, v, z = y
     return (q, v), z
-
-
-def check_auxiliary_rates(rates: Any, z: Y) -> None:
-    shapes = lambda tree: jtu.tree_map(jnp.shape, tree)
-    if jtu.tree_structure(rates) != jtu.tree_structure(z) or shapes(rates) != shapes(z):
-        raise ValueError(
-            f"`auxiliary` must return h(t, q, v, z, args) of the structure and shapes of z, {shapes(z)}, got {shapes(rates)}."
-        )
 
 
 def _projections(projection: NewtonProjection, y: Y) -> tuple[NewtonProjection, NewtonProjection]:
@@ -97,8 +89,6 @@ def _projections(projection: NewtonProjection, y: Y) -> tuple[NewtonProjection, 
         return projection, projection
     if jtu.tree_structure(projection.metric) != jtu.tree_structure(y):
         projection.inverse_metric(y)  # says so
+    of_part = lambda metric: dataclasses.replace(projection, metric=metric)
     motion, z = split(projection.metric)
-    return (
-        dataclasses.replace(projection, metric=motion),
-        dataclasses.replace(projection, metric=z),
-    )
+    return of_part(motion), of_part(z)

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._base.closure import convert_closure
-from .._base.types import Args, BoolScalar, Y
+from .._base.types import BoolScalar, Y
 from .._constraint.correction import (
     ConstraintNormals,
     CorrectionEquations,
@@ -27,10 +27,9 @@ from .._constraint.correction import (
     solve_correction,
 )
 from .._constraint.settings import NewtonProjection
-from .._linalg.rows import InverseWeights
+from .._linalg.rows import directions_of, InverseWeights
 from .._linalg.sparse import SparseRows
-from .kinematics import Kinematics
-from .mass import directions_of
+from .kinematics import flat, Kinematics
 
 
 class InverseMetrics(NamedTuple):
@@ -51,27 +50,17 @@ class InverseMetrics(NamedTuple):
 
 
 class TwoStages(NamedTuple):
-    """How states near one are corrected; `directions` are `V^T` if they are not those of the
-    state itself."""
+    """How a state is corrected; `directions` are `V^T` if they are not those of the state itself."""
 
-    equations: Kinematics
-    t: Array
-    args: Args
+    here: Kinematics
     projection: NewtonProjection
     metrics: InverseMetrics | None
     directions: Float[Array, "m k"] | None
-    redundant: bool
 
-    def dense(self) -> "TwoStages":
-        return self._replace(equations=self.equations.dense())
-
-    def correct(
-        self, y: Y, fallback: Y, far: bool
-    ) -> tuple[Y, tuple[CorrectionRoot, CorrectionRoot]]:
+    def correct(self, fallback: Y, far: bool) -> tuple[Y, tuple[CorrectionRoot, CorrectionRoot]]:
         """The corrected state, and the roots for the positions and the velocities."""
-        equations = self.equations
-        x, w = equations.flat(y)
-        safe_x, safe_w = jax.lax.stop_gradient(equations.flat(fallback))
+        x, w = self.here.x, self.here.w
+        safe_x, safe_w = jax.lax.stop_gradient(flat(fallback))
         # Replaced before anything is evaluated there: the derivative of a NaN is never zero.
         finite = jnp.all(jnp.isfinite(x)) & jnp.all(jnp.isfinite(w))
         x, w = jnp.where(finite, x, safe_x), jnp.where(finite, w, safe_w)
@@ -81,27 +70,29 @@ class TwoStages(NamedTuple):
         if far:  # the matrix at the corrected positions: the nearest velocities
             factored, _ = self._factored(positions.p, w)
         # Velocities are found by one iteration unless their equations are the user's.
-        far = far and self.equations.nonholonomic is not None
-        velocities = self._velocities(positions.p, w, safe_w, factored, far)
+        far = far and self.here.nonholonomic is not None
+        context = positions.p, self.here.args
+        velocities = self._solve(self.here.velocity, w, context, safe_w, factored, far)
         corrected = tuple(
-            equations.unravel(jnp.where(finite, root.p, jnp.nan))
+            self.here.unravel(jnp.where(finite, root.p, jnp.nan))
             for root in (positions, velocities)
         )
         return corrected, (_failed_unless(finite, positions), _failed_unless(finite, velocities))
 
     def normals(self, x: Float[Array, " k"], w: Float[Array, " k"]) -> "MechanicalNormals":
-        C, p = self.equations.rows(self.t, x, w, self.args)
+        here = self.here._replace(x=x, w=w)
+        C, p = here.rows()
         directions, valid = self.directions, jnp.asarray(True)
         if directions is None and self.metrics is not None:
             directions = directions_of(InverseWeights(self.metrics.velocities), C)
         elif directions is None:
-            mass = self.equations.mass(self.t, x, w, self.args, C)
+            mass = here.mass(C)
             directions, valid = directions_of(mass, C), mass.valid
         return MechanicalNormals(ConstraintNormals(C, directions), p, valid)
 
     def _factored(self, x: Float[Array, " k"], w: Float[Array, " k"]) -> tuple[FactoredGram, int]:
         normals, p, valid = self.normals(x, w)
-        factored = FactoredGram.of(normals, self.redundant)
+        factored = FactoredGram.of(normals, self.here.system.redundant)
         full_rank = factored.factorization.full_rank & valid
         factorization = dataclasses.replace(factored.factorization, full_rank=full_rank)
         return FactoredGram(normals, factorization), p
@@ -109,42 +100,31 @@ class TwoStages(NamedTuple):
     def _positions(self, x, safe, factored: FactoredGram, p: int, far: bool) -> CorrectionRoot:
         if p == 0:
             return _nothing_to_do(x)
-        if self.equations.nonholonomic is not None or self.metrics is not None:
+        if self.here.nonholonomic is not None or self.metrics is not None:
             normals = self._position_normals(x, factored.normals, p)
-            factored = FactoredGram.of(normals, self.redundant)
-        residual = convert_closure(self.equations.position, self.t, x, self.args)
-        return self._solve(residual, x, self.args, safe, factored, far)
+            factored = FactoredGram.of(normals, self.here.system.redundant)
+        return self._solve(self.here.position, x, self.here.args, safe, factored, far)
 
     def _position_normals(self, x, normals: ConstraintNormals, p: int) -> ConstraintNormals:
         (C, directions), metrics = normals, self.metrics
-        J = self.equations.position_rows(self.t, x, x, self.args, C, p)
+        J = self.here._replace(x=x, w=x).position_rows(C, p)
         if metrics is not None:  # one for positions of its own
             return ConstraintNormals(J, directions_of(InverseWeights(metrics.positions), J))
-        if isinstance(J, SparseRows):
-            return ConstraintNormals(J, J.along(directions.metric))
+        if isinstance(directions, SparseRows):  # `J` may have too few rows for that
+            return ConstraintNormals(J, directions_of(directions.metric, J))  # pyright: ignore[reportArgumentType]
         return ConstraintNormals(J, directions[:p])
 
-    def _velocities(self, x, w, safe, factored: FactoredGram, far: bool) -> CorrectionRoot:
-        context = (x, self.args)
-        residual = convert_closure(self.equations.velocity, self.t, w, context)
-        return self._solve(residual, w, context, safe, factored, far)
-
     def _solve(self, residual, x, args, safe, factored: FactoredGram, far: bool) -> CorrectionRoot:
-        equations = CorrectionEquations(
-            residual,
-            self.t,
-            x,
-            args,
-            directions=factored.normals.directions,
-            redundant=self.redundant,
-        )
+        t, directions = self.here.t, factored.normals.directions
+        residual = convert_closure(residual, t, x, args)
+        redundant = self.here.system.redundant
+        equations = CorrectionEquations(residual, t, x, args, None, directions, redundant)
         return solve_correction(equations, safe, self.projection, far, factored)
 
 
 class MechanicalNormals(NamedTuple):
     """The constraint normals with respect to the velocities; how many of the rows belong to
-    positions, and whether the
-    mass matrix can be used."""
+    positions, and whether the mass matrix can be used."""
 
     normals: ConstraintNormals
     num_positions: int

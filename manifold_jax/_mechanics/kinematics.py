@@ -2,20 +2,23 @@
 
 import abc
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import equinox as eqx
 import jax
 import jax.flatten_util as jfu
 import jax.numpy as jnp
-import jax.tree_util as jtu
 from jaxtyping import Array, Float
 
+from .._base.shapes import are_alike, shapes
 from .._base.types import Args, RealScalarLike, Y
-from .._constraint.residual import jacobian
+from .._constraint.residual import as_time, jacobian
 from .._linalg.rows import AbstractRows, Rows
 from .._linalg.sparse import Choice, choose_structure, SparseRows, Structure
 from .mass import factorize_mass, InvertedBlocks, Mass, mass_values
+
+
+Vector: TypeAlias = Float[Array, " k"]
 
 
 class AbstractPositions(eqx.Module):
@@ -30,67 +33,69 @@ class AbstractPositions(eqx.Module):
 
 
 class Kinematics(NamedTuple):
-    """The constraints as functions of vectors, `x` for positions and `w` for velocities, each of
-    `k` numbers."""
+    """The constraints of a mechanical system at one state, as functions of vectors of `k` numbers, `x`
+    for positions and `w` for velocities; and its mass matrix there."""
 
-    holonomic: Callable | None
+    system: Any  # or its constraint
     nonholonomic: Callable | None
-    mass_matrix: Callable
-    unravel: Callable
     structure: Choice
-    redundant: bool
+    unravel: Callable
+    t: Array
+    x: Vector
+    w: Vector
+    args: Args
 
     @staticmethod
-    def of(system: Any, y: Y) -> "Kinematics":
-        """Return the kinematics of a mechanical system, or of its constraint, for states like
-        `y`."""
-        q, _ = check_mechanical_state(y)
-        unravel = jfu.ravel_pytree(q)[1]
-        return Kinematics(
-            system.holonomic,
-            system.nonholonomic,
-            system.mass_matrix,
-            unravel,
-            system.structure,
-            system.redundant,
-        )
+    def of(system: Any, t: RealScalarLike, y: Y, args: Args) -> "Kinematics":
+        _check_mechanical_state(y)
+        x, w = flat(y)
+        fields = system.nonholonomic, system.structure, jfu.ravel_pytree(y[0])[1]
+        return Kinematics(system, *fields, as_time(t, x.dtype), x, w, args)
 
     def dense(self) -> "Kinematics":
         """The same, with Jacobians as arrays."""
         return self._replace(structure="dense")
 
-    def flat(self, y: Y) -> tuple[Float[Array, " k"], Float[Array, " k"]]:
-        q, v = y
-        return jfu.ravel_pytree(q)[0], jfu.ravel_pytree(v)[0]
-
-    def position(self, t: Array, x: Float[Array, " k"], args: Args) -> Float[Array, " p"]:
-        if self.holonomic is None:
+    def position(self, t: Array, x: Vector, args: Args) -> Float[Array, " p"]:
+        if self.system.holonomic is None:
             return jnp.zeros((0,), x.dtype)
-        return jfu.ravel_pytree(self.holonomic(t, self.unravel(x), args))[0]
+        return jfu.ravel_pytree(self.system.holonomic(t, self.unravel(x), args))[0]
 
-    def velocity(
-        self, t: Array, w: Float[Array, " k"], context: tuple[Float[Array, " k"], Args]
-    ) -> Float[Array, " m"]:
+    def velocity(self, t: Array, w: Vector, context: tuple[Vector, Args]) -> Float[Array, " m"]:
         """Residual of the velocities at the positions in `context`."""
         x, args = context
         position = lambda t, x: self.position(t, x, args)
         _, rate = jax.jvp(position, (t, x), (jnp.ones_like(t), w))
         if self.nonholonomic is None:
             return rate
-        extra = self.nonholonomic(t, self.unravel(x), self.unravel(w), args)
-        return jnp.concatenate([rate, jfu.ravel_pytree(extra)[0]])
+        return jnp.concatenate([rate, self._nonholonomic(t, w, context)])
 
-    def rows(
-        self, t: Array, x: Float[Array, " k"], w: Float[Array, " k"], args: Args
-    ) -> tuple[Rows, int]:
+    def _nonholonomic(self, t: Array, w: Vector, context: tuple[Vector, Args]) -> Array:
+        x, args = context
+        assert self.nonholonomic is not None
+        return jfu.ravel_pytree(self.nonholonomic(t, self.unravel(x), self.unravel(w), args))[0]
+
+    def positions(self) -> Float[Array, " p"]:
+        return self.position(self.t, self.x, self.args)
+
+    def velocities(self) -> Float[Array, " m"]:
+        return self.velocity(self.t, self.w, (self.x, self.args))
+
+    def acceleration_bias(self) -> Float[Array, " m"]:
+        """What the second derivative of the constraints is at zero acceleration."""
+        velocity = lambda t, x: self.velocity(t, self.w, (x, self.args))
+        return jax.jvp(velocity, (self.t, self.x), (jnp.ones_like(self.t), self.w))[1]
+
+    def rows(self) -> tuple[Rows, int]:
         """`C = [J; da/dv]`, and how many of the rows belong to positions."""
-        if (structure := self.structure_at(t, x, w, args)) is not None:
+        t, x, w, args = self.t, self.x, self.w, self.args
+        if (structure := self.structure_here()) is not None:
             p = jax.eval_shape(self.position, t, x, args).size
             if self.nonholonomic is None:
                 return SparseRows.of(self.position, t, x, args, structure), p
             return SparseRows.of(self.velocity, t, w, (x, args), structure), p
-        if isinstance(self.holonomic, AbstractPositions):
-            J = self.holonomic.jacobian(t, self.unravel(x), args)
+        if isinstance(self.system.holonomic, AbstractPositions):
+            J = self.system.holonomic.jacobian(t, self.unravel(x), args)
         else:
             _, J = jacobian(lambda x: self.position(t, x, args), x)
         if self.nonholonomic is None:
@@ -98,66 +103,48 @@ class Kinematics(NamedTuple):
         nonholonomic = lambda w: self.velocity(t, w, (x, args))[J.shape[0] :]
         return jnp.concatenate([J, jacobian(nonholonomic, w)[1]]), J.shape[0]
 
-    def position_rows(
-        self, t: Array, x: Float[Array, " k"], w: Float[Array, " k"], args: Args, C: Rows, p: int
-    ) -> Rows:
+    def position_rows(self, C: Rows, p: int) -> Rows:
         """`J`, the first `p` of the rows `C`."""
         if isinstance(C, AbstractRows):
-            of_positions = self._replace(nonholonomic=None)
-            return of_positions.rows(t, x, w, args)[0]
+            return self._replace(nonholonomic=None).rows()[0]
         return C[:p]
 
-    def structure_at(
-        self, t: Array, x: Float[Array, " k"], w: Float[Array, " k"], args: Args
-    ) -> Structure | None:
+    def structure_here(self) -> Structure | None:
         """Return the structure of the rows, if they are sparse. Known while tracing."""
-        if self.structure == "dense" or self.redundant:
+        t, args, equations = self.t, self.args, []
+        if self.structure == "dense" or self.system.redundant:
             return None
-        equations = []
-        if self.holonomic is not None:
-            equations.append((lambda x: self.position(t, x, args), x))
+        if self.system.holonomic is not None:
+            equations.append((lambda x: self.position(t, x, args), self.x))
         if self.nonholonomic is not None:
-            extra = lambda w: self.nonholonomic(t, self.unravel(x), self.unravel(w), args)  # pyright: ignore[reportOptionalCall]
-            equations.append((lambda w: jfu.ravel_pytree(extra(w))[0], w))
-        mass = jax.eval_shape(lambda: self.mass_values(t, x, w, args))
+            equations.append((lambda w: self._nonholonomic(t, w, (self.x, args)), self.w))
+        mass = jax.eval_shape(self.mass_values)
         return choose_structure(self.structure, tuple(equations), mass.shape)
 
-    def acceleration_bias(
-        self, t: Array, x: Float[Array, " k"], w: Float[Array, " k"], args: Args
-    ) -> Float[Array, " m"]:
-        """What the second derivative of the constraints is at zero acceleration."""
-        velocity = lambda t, x: self.velocity(t, w, (x, args))
-        return jax.jvp(velocity, (t, x), (jnp.ones_like(t), w))[1]
+    def mass(self, C: Rows) -> Mass | InvertedBlocks:
+        return factorize_mass(self.mass_values(), C)
 
-    def mass(
-        self,
-        t: Array,
-        x: Float[Array, " k"],
-        w: Float[Array, " k"],
-        args: Args,
-        C: Rows,
-    ) -> Mass | InvertedBlocks:
-        return factorize_mass(self.mass_values(t, x, w, args), C)
-
-    def mass_values(
-        self, t: Array, x: Float[Array, " k"], w: Float[Array, " k"], args: Args
-    ) -> Float[Array, "..."] | InvertedBlocks:
-        q, v = self.unravel(x), self.unravel(w)
-        return mass_values(self.mass_matrix(t, q, v, args), q)
+    def mass_values(self) -> Float[Array, "..."] | InvertedBlocks:
+        q, v = self.unravel(self.x), self.unravel(self.w)
+        return mass_values(self.system.mass_matrix(self.t, q, v, self.args), q)
 
 
-def check_mechanical_state(y: Y) -> tuple[Any, Any]:
+def flat(y: Y) -> tuple[Vector, Vector]:
+    """Positions and velocities as vectors."""
+    q, v = y
+    return jfu.ravel_pytree(q)[0], jfu.ravel_pytree(v)[0]
+
+
+def _check_mechanical_state(y: Y) -> None:
     """Refuse, while tracing, states that are not `(q, v)`."""
     if not (isinstance(y, tuple) and len(y) == 2):
         raise ValueError(
             "`y` must be the tuple `(q, v)` of positions and velocities of a mechanical system, got shapes "
-            f"{jtu.tree_map(jnp.shape, y)}. Write e.g. `y0 = (q0, jnp.zeros_like(q0))`."
+            f"{shapes(y)}. Write e.g. `y0 = (q0, jnp.zeros_like(q0))`."
         )
     q, v = y
-    shapes = lambda tree: jtu.tree_map(jnp.shape, tree)
-    if jtu.tree_structure(q) != jtu.tree_structure(v) or shapes(q) != shapes(v):
+    if not are_alike(q, v):
         raise ValueError(
             f"`y` = (q, v) must have velocities of the same structure and shapes as the positions, v = dq/dt, got "
             f"{shapes(q)} and {shapes(v)}."
         )
-    return q, v

@@ -1,7 +1,7 @@
 """The mass matrix in its forms (scalar, diagonal, blocks, matrix), factored once per evaluation."""
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -10,9 +10,10 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, Float
 
+from .._base.shapes import shapes
 from .._base.types import Args, BoolScalar, RealScalarLike, Y
-from .._linalg.dense import Factorization, factorize, gram, UNROLL_LIMIT
-from .._linalg.rows import InverseWeights, Rows
+from .._linalg.dense import Factorization, factorize_positive, gram
+from .._linalg.rows import Rows
 from .._linalg.sparse import SparseRows
 
 
@@ -72,14 +73,11 @@ class InvertedBlocks(eqx.Module):
     inverse: Float[Array, "b d d"]
     symmetric: BoolScalar
     positive: BoolScalar
+    augmentation: ClassVar[None] = None
 
     @property
     def shape(self) -> tuple[int, ...]:
         return self.inverse.shape
-
-    @property
-    def augmentation(self) -> None:
-        return None
 
     @property
     def valid(self) -> BoolScalar:
@@ -93,11 +91,6 @@ class InvertedBlocks(eqx.Module):
         return jnp.sum(inverse * parts, axis=-1).reshape(rows.shape)
 
 
-def directions_of(metric: "Mass | InvertedBlocks | InverseWeights", C: Rows) -> Rows:
-    """The rows of `V^T = C W^-1`."""
-    return C.along(metric) if isinstance(C, SparseRows) else metric.solve(C)
-
-
 def mass_values(mass_matrix: Any, q: Y) -> Float[Array, "..."] | InvertedBlocks:
     """What `mass_matrix` returned as a scalar, a diagonal `(n,)`, a matrix `(n, n)` or its blocks
     `(n / d, d, d)`."""
@@ -105,11 +98,9 @@ def mass_values(mass_matrix: Any, q: Y) -> Float[Array, "..."] | InvertedBlocks:
         return mass_matrix
     x, _ = jfu.ravel_pytree(q)
     n = x.size
-    if eqx.is_array_like(mass_matrix) and _is_blocks(jnp.shape(mass_matrix), n):
+    shape = jnp.shape(mass_matrix) if eqx.is_array_like(mass_matrix) else None
+    if shape is not None and (shape in ((), (n,), (n, n)) or _is_blocks(shape, n)):
         return jnp.asarray(mass_matrix, x.dtype)
-    if eqx.is_array_like(mass_matrix) and jnp.shape(mass_matrix) in ((), (n,), (n, n)):
-        return jnp.asarray(mass_matrix, x.dtype)
-    shapes = jtu.tree_map(jnp.shape, mass_matrix)
     # Others are not spread: of masses of shape (2,) and q of shape (2, 2) nobody can say whether
     # they belong to two bodies or to two coordinates.
     if jtu.tree_structure(mass_matrix) == jtu.tree_structure(q):
@@ -120,7 +111,7 @@ def mass_values(mass_matrix: Any, q: Y) -> Float[Array, "..."] | InvertedBlocks:
     raise ValueError(
         f"`mass_matrix` must be a scalar, a diagonal of shape ({n},) or of the shapes of q, a matrix of shape ({n}, "
         f"{n}), or the blocks on its diagonal, of shape (bodies, d, d), for q of {n} numbers of "
-        f"shapes {jtu.tree_map(jnp.shape, q)}, got {shapes}. Masses of points whose "
+        f"shapes {shapes(q)}, got {shapes(mass_matrix)}. Masses of points whose "
         "positions are the rows of q: `jnp.broadcast_to(masses[:, None], q.shape)`."
     )
 
@@ -142,11 +133,14 @@ def factorize_mass(M: Float[Array, "..."] | InvertedBlocks, C: Rows) -> Mass | I
         return Mass(jnp.where(positive, M, 1), None, None, yes, positive)
     if M.ndim == 3:
         return _factorize_blocks(M, C)
-    asymmetry = jnp.max(jnp.abs(M - M.T))
-    symmetric = asymmetry <= 100 * jnp.finfo(M.dtype).eps * jnp.max(jnp.abs(M))
-    weights = jax.lax.stop_gradient(_weights(M, C))
-    factorization = _factorize_positive(M + gram((C * weights[:, None]).T, C.T))
+    symmetric, weights = _is_symmetric(M), jax.lax.stop_gradient(_weights(M, C))
+    factorization = factorize_positive(M + gram((C * weights[:, None]).T, C.T))
     return Mass(None, factorization, weights, symmetric, factorization.full_rank)
+
+
+def _is_symmetric(M: Float[Array, "*b n n"]) -> BoolScalar:
+    asymmetry = jnp.max(jnp.abs(M - jnp.swapaxes(M, -1, -2)))
+    return asymmetry <= 100 * jnp.finfo(M.dtype).eps * jnp.max(jnp.abs(M))
 
 
 def _is_blocks(shape: tuple[int, ...], n: int) -> bool:
@@ -158,12 +152,10 @@ def _factorize_blocks(M: Float[Array, "b d d"], C: Rows) -> Mass | InvertedBlock
     of a quaternion): a block may be singular in the directions that those exclude."""
     if not isinstance(C, SparseRows):
         return factorize_mass(jax.scipy.linalg.block_diag(*M), C)
-    asymmetry = jnp.max(jnp.abs(M - jnp.swapaxes(M, 1, 2)))
-    symmetric = asymmetry <= 100 * jnp.finfo(M.dtype).eps * jnp.max(jnp.abs(M))
-    augmentation = jnp.zeros((C.structure.num_equations,), M.dtype)
+    symmetric, augmentation = _is_symmetric(M), jnp.zeros((C.structure.num_equations,), M.dtype)
     if C.structure.local.any():
         M, augmentation = _augmented(M, C)
-    factorization = jax.vmap(_factorize_positive)(M)
+    factorization = jax.vmap(factorize_positive)(M)
     return Mass(None, factorization, augmentation, symmetric, jnp.all(factorization.full_rank))
 
 
@@ -197,14 +189,3 @@ def _masses(M: Float[Array, "n n"]) -> Float[Array, " n"]:
     diagonal = jnp.diagonal(M)
     mean, eps = jnp.mean(jnp.abs(diagonal)), jnp.finfo(M.dtype).eps
     return jnp.where(diagonal > 10 * eps * mean, diagonal, mean)
-
-
-def _factorize_positive(M: Float[Array, "n n"]) -> Factorization:
-    if M.shape[0] <= UNROLL_LIMIT:
-        return factorize(M)  # which wants positive pivots  # pyright: ignore[reportReturnType]
-    threshold = 10 * M.shape[0] * float(jnp.finfo(M.dtype).eps)
-    size = jnp.sqrt(jnp.maximum(jnp.abs(jnp.diagonal(M)), jnp.finfo(M.dtype).tiny))
-    lower = jnp.linalg.cholesky(jax.lax.stop_gradient(M / size[:, None] / size[None, :]))
-    positive = jnp.all(jnp.diagonal(lower) ** 2 > threshold)  # NaN unless positive definite
-    factorization = factorize(jnp.where(positive, M, jnp.eye(M.shape[0], dtype=M.dtype)))
-    return Factorization(factorization.A, factorization.lu, positive)  # pyright: ignore[reportAttributeAccessIssue]

@@ -9,13 +9,20 @@ import jax.flatten_util as jfu
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from .._base.shapes import are_alike, shapes
 from .._base.types import Args, BoolScalar, RealScalarLike, Y
-from .._linalg.dense import Factorization, factorize, gram, gram_written_out, UNROLL_LIMIT
-from .._linalg.rows import AbstractRows, combine, multiply
+from .._linalg.dense import (
+    Factorization,
+    factorize,
+    gram,
+    gram_written_out,
+    pseudo_invert,
+    UNROLL_LIMIT,
+)
+from .._linalg.rows import AbstractRows, combine, directions_of, multiply
 from .auxiliary import split
-from .kinematics import check_mechanical_state, Kinematics
-from .mass import directions_of
-from .saddle_point import Factored, solve_held_fixed
+from .kinematics import Kinematics
+from .saddle_point import Factored, Pair, solve_held_fixed
 
 
 class LagrangianForce(eqx.Module):
@@ -48,41 +55,35 @@ class Motion:
 
     def __init__(self, system: Any, t: RealScalarLike, y: Y, args: Args):
         state = y if system.auxiliary is None else split(y)[0]
-        q, v = check_mechanical_state(state)
-        auxiliary = () if system.auxiliary is None else y[2:]
-        self.equations = Kinematics.of(system, state)
-        self.unravel = self.equations.unravel
-        self.x, self.w = self.equations.flat(state)
-        self.t, self.args = jnp.asarray(t, self.x.dtype), args
-        self.C, self.num_positions = self.equations.rows(self.t, self.x, self.w, args)
-        self.bias = self.equations.acceleration_bias(self.t, self.x, self.w, args)
-        self.force = _flat_force(system.force(t, q, v, *auxiliary, args), q, self.x)
-        self.mass = self.equations.mass(self.t, self.x, self.w, args, self.C)
+        here = Kinematics.of(system, t, state, args)
+        self.here = here._replace(t=jnp.asarray(here.t, here.x.dtype))
+        self.unravel, self.redundant = here.unravel, system.redundant
+        self.C, self.num_positions = self.here.rows()
+        self.bias = self.here.acceleration_bias()
+        self.force = _flat_force(system.force(t, *y, args), state[0], here.x)
+        self.mass = self.here.mass(self.C)
         self.directions = directions_of(self.mass, self.C)
-        self.redundant = system.redundant
         if isinstance(self.C, AbstractRows):
             self.factorization = self.C.factorize(self.directions, checked=False)
         else:
             gram_matrix = gram_written_out(self.C, self.directions)
-            self.factorization = factorize(gram_matrix, system.redundant)
+            self.factorization = (pseudo_invert if self.redundant else factorize)(gram_matrix)
 
-    def solve(self, bias: Float[Array, " m"]) -> tuple[Float[Array, " n"], Float[Array, " m"]]:
+    def solve(self, bias: Float[Array, " m"]) -> Pair:
         """Accelerations and multipliers of `M a + C^T lambda = Q`, `C a = -bias`."""
         force = self.force
-        if self._is_large() and isinstance(self.factorization, Factorization):
-            M = self.equations.mass_values(self.t, self.x, self.w, self.args)
+        if isinstance(self.factorization, Factorization) and bias.size > UNROLL_LIMIT:
+            # The derivative of `C M^-1 C^T` would cost more than what is around it.
+            M = self.here.mass_values()
             factored = Factored(self.C, self.directions, self.mass, self.factorization)
-            accelerations, multipliers = solve_held_fixed(M, self.C, factored, force, -bias)
-            undefined = jnp.where(self.mass.valid & self.factorization.full_rank, 0, jnp.nan)
-            undefined = undefined.astype(force.dtype)
-            return accelerations + undefined, multipliers + undefined
+            pair = solve_held_fixed(M, factored, force, -bias)
+            return _defined(*pair, self.mass.valid & self.factorization.full_rank)
         if self.mass.augmentation is not None:
             force = force - combine(self.mass.augmentation * bias, self.C)
         free = self.mass.solve(force)
         right = multiply(self.C, free) + bias
         multipliers = self.factorization.solve(right)
         accelerations = free - combine(multipliers, self.directions)
-        # Added, not selected: the derivative of a discarded NaN would be NaN.
         valid = self.mass.valid & self.factorization.full_rank
         if isinstance(self.C, AbstractRows):
             # `M` applied to the free accelerations and to those by the constraints.
@@ -91,12 +92,7 @@ class Motion:
             valid &= self.factorization.solves(residual, size2)  # pyright: ignore[reportAttributeAccessIssue]
         elif self.redundant:
             valid &= _agree(self.C, accelerations, bias)
-        undefined = jnp.where(valid, 0, jnp.nan).astype(free.dtype)
-        return accelerations + undefined, multipliers + undefined
-
-    def _is_large(self) -> bool:
-        """Whether the derivative of `C M^-1 C^T` would cost more than what is around it."""
-        return not isinstance(self.C, AbstractRows) and self.bias.size > UNROLL_LIMIT
+        return _defined(accelerations, multipliers, valid)
 
     def constrained(self, b: Float[Array, " m"]) -> Float[Array, " n"]:
         """The smallest change of the velocities, in the metric of the masses, with `C dv = b`."""
@@ -104,14 +100,19 @@ class Motion:
 
     def stabilized_velocity(self) -> Float[Array, " n"]:
         p = self.num_positions
-        rate = self.equations.velocity(self.t, self.w, (self.x, self.args))[:p]
-        J = self.equations.position_rows(self.t, self.x, self.w, self.args, self.C, p)
+        rate, J = self.here.velocities()[:p], self.here.position_rows(self.C, p)
         directions = directions_of(self.mass, J)
         if isinstance(J, AbstractRows):
             factorization = J.factorize(directions)
         else:
-            factorization = factorize(gram(J, directions), self.redundant)
-        return self.w - combine(factorization.solve(rate), directions)
+            factorization = (pseudo_invert if self.redundant else factorize)(gram(J, directions))
+        return self.here.w - combine(factorization.solve(rate), directions)
+
+
+def _defined(a: Float[Array, " n"], multipliers: Float[Array, " m"], valid: BoolScalar) -> Pair:
+    """NaN unless valid. Added, not selected: the derivative of a discarded NaN would be NaN."""
+    undefined = jnp.where(valid, 0, jnp.nan).astype(a.dtype)
+    return a + undefined, multipliers + undefined
 
 
 def _agree(C: Float[Array, "m n"], a: Float[Array, " n"], bias: Float[Array, " m"]) -> BoolScalar:
@@ -126,8 +127,7 @@ def _agree(C: Float[Array, "m n"], a: Float[Array, " n"], bias: Float[Array, " m
 
 
 def _flat_force(force: Any, q: Y, x: Float[Array, " n"]) -> Float[Array, " n"]:
-    shapes = lambda tree: jax.tree_util.tree_map(jnp.shape, tree)
-    if shapes(force) != shapes(q):
+    if not are_alike(force, q):
         raise ValueError(
             f"`force` must return Q(t, q, v, args) of the structure and shapes of q, {shapes(q)}, got {shapes(force)}."
         )

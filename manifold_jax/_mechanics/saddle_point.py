@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._linalg.dense import Factorization
-from .._linalg.rows import combine, multiply
+from .._linalg.rows import combine, multiply, product
 from .mass import InvertedBlocks, Mass
 
 
@@ -45,19 +45,17 @@ class Factored(NamedTuple):
         return f - combine(multipliers, self.directions), multipliers
 
 
-def solve_held_fixed(
-    M: Any, C: Float[Array, "m n"], factored: Factored, force: Float[Array, " n"], r: Any
-) -> Pair:
+def solve_held_fixed(M: Any, factored: Factored, force: Float[Array, " n"], r: Any) -> Pair:
     """Accelerations and multipliers, with the derivatives of `M` (as of `mass_values`), `C`, `force`
-    and `r`, but not of what was `factored`."""
-    factored = jax.lax.stop_gradient(factored)
+    and `r`, but not of what was factored."""
+    C, factored = factored.C, jax.lax.stop_gradient(factored)
     if isinstance(M, InvertedBlocks):  # with M^-1 p in the place of a, as M is not known
         momenta = lambda p, z: (p + combine(z, C), multiply(C, M.solve(p)))
         p, multipliers = _solve_linear(
             momenta, force, r, factored.momenta, factored.momenta_transposed
         )
         return M.solve(p), multipliers
-    both = lambda a, z: (_apply(M, a) + combine(z, C), multiply(C, a))
+    both = lambda a, z: (product(M, a) + combine(z, C), multiply(C, a))
     return _solve_linear(both, force, r, factored.accelerations, factored.accelerations)
 
 
@@ -73,12 +71,3 @@ def _solve_linear(product: Any, force: Any, r: Any, solve: Any, solve_transposed
         lambda _, b: as_one(solve_transposed)(b),
     )
     return x[:n], x[n:]
-
-
-def _apply(M: Float[Array, "..."], a: Float[Array, " n"]) -> Float[Array, " n"]:
-    """`M a`, with `M` in one of the forms of `mass_values`."""
-    if M.ndim < 2:
-        return M * a
-    if M.ndim == 2:
-        return M @ a
-    return jnp.sum(M * a.reshape(M.shape[0], 1, -1), axis=-1).reshape(-1)

@@ -10,16 +10,24 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._base.errors import refuse_old_names
+from .._base.shapes import are_alike, shapes
 from .._base.types import Args, RealScalarLike, Y
 from .._base.user_functions import check_function
 from .._constraint.constraint import AbstractConstraint
 from .._linalg.sparse import check_choice, Choice
 from .._solver.terms import DirectedTerm
-from .auxiliary import check_auxiliary_rates, ExtendedConstraint
+from .auxiliary import ExtendedConstraint
 from .constraint import MechanicalConstraint
 from .mass import ConfigurationMass, LagrangianMass
 from .motion import LagrangianForce, Motion
 from .stabilization import Baumgarte, VelocityStabilization
+
+
+_old_names = refuse_old_names(
+    constraint="position_constraint",
+    further="auxiliary",
+    further_constraint="auxiliary_constraint",
+)
 
 
 class MechanicalSystem(eqx.Module):
@@ -94,11 +102,7 @@ class MechanicalSystem(eqx.Module):
     redundant: bool = eqx.field(static=True)
     structure: Choice = eqx.field(static=True)
 
-    @refuse_old_names(
-        constraint="position_constraint",
-        further="auxiliary",
-        further_constraint="auxiliary_constraint",
-    )
+    @_old_names
     def __init__(
         self,
         mass_matrix: Any,
@@ -112,9 +116,6 @@ class MechanicalSystem(eqx.Module):
         redundant: bool = False,
         structure: Choice = "auto",
     ):
-        _check_arguments(position_constraint, force, velocity_constraint, stabilization, auxiliary)
-        _check_auxiliary(auxiliary, auxiliary_constraint)
-        check_choice(structure, redundant)
         own = isinstance(mass_matrix, LagrangianMass | ConfigurationMass)  # of another system
         if callable(mass_matrix) and not own:
             check_function("mass_matrix", mass_matrix, "M(q, args)")
@@ -128,12 +129,38 @@ class MechanicalSystem(eqx.Module):
         self.redundant = redundant
         self.structure = structure
 
+    def __check_init__(self):
+        _check_force(self.force, self.auxiliary)
+        if self.holonomic is not None:
+            check_function("position_constraint", self.holonomic, "phi(t, q, args)")
+        if self.nonholonomic is not None:
+            check_function("velocity_constraint", self.nonholonomic, "a(t, q, v, args)")
+        if self.holonomic is None and self.nonholonomic is None:
+            raise ValueError(
+                "`position_constraint` is None and there is no `velocity_constraint`: without constraints use "
+                "`diffrax.ODETerm` and the solver alone."
+            )
+        if not isinstance(self.stabilization, Baumgarte | VelocityStabilization | None):
+            raise TypeError(
+                "`stabilization` must be `mj.Baumgarte(alpha, beta)` or `mj.VelocityStabilization()`, got "
+                f"{type(self.stabilization).__name__}. Others are arguments of `mj.Stabilized`."
+            )
+        if self.auxiliary is not None:
+            check_function("auxiliary", self.auxiliary, "h(t, q, v, z, args)")
+        elif self.auxiliary_constraint is not None:
+            raise ValueError(
+                "`auxiliary_constraint` is for the states of `auxiliary`, which is None. Constraints on positions and "
+                "velocities are `position_constraint` and `velocity_constraint`."
+            )
+        if not isinstance(self.auxiliary_constraint, AbstractConstraint | None):
+            raise TypeError(
+                "`auxiliary_constraint` must be an `mj.Constraint` on z, or another one, got "
+                f"{type(self.auxiliary_constraint).__name__}. Write e.g. `mj.Constraint(lambda t, z, args: z @ z - 1.0)`."
+            )
+        check_choice(self.structure, self.redundant)
+
     @classmethod
-    @refuse_old_names(
-        constraint="position_constraint",
-        further="auxiliary",
-        further_constraint="auxiliary_constraint",
-    )
+    @_old_names
     def from_lagrangian(
         cls,
         lagrangian: Callable,
@@ -171,11 +198,9 @@ class MechanicalSystem(eqx.Module):
             redundant=self.redundant,
             structure=self.structure,
         )
-        return (
-            motion
-            if self.auxiliary is None
-            else ExtendedConstraint(motion=motion, auxiliary=self.auxiliary_constraint)  # pyright: ignore[reportCallIssue]
-        )
+        if self.auxiliary is None:
+            return motion
+        return ExtendedConstraint(motion=motion, auxiliary=self.auxiliary_constraint)  # pyright: ignore[reportCallIssue]
 
     @property
     def terms(self) -> dfx.AbstractTerm:
@@ -208,8 +233,11 @@ class MechanicalSystem(eqx.Module):
     def _auxiliary_rates(self, t: RealScalarLike, y: Y, args: Args) -> tuple[Y, ...]:
         if self.auxiliary is None:
             return ()
-        rates = self.auxiliary(t, *y, args)
-        check_auxiliary_rates(rates, y[2])
+        z, rates = y[2], self.auxiliary(t, *y, args)
+        if not are_alike(rates, z):
+            raise ValueError(
+                f"`auxiliary` must return h(t, q, v, z, args) of the structure and shapes of z, {shapes(z)}, got {shapes(rates)}."
+            )
         return (rates,)
 
     def _stabilized_field(self, t: RealScalarLike, y: Y, args: Args) -> tuple[Y, Y]:
@@ -217,57 +245,14 @@ class MechanicalSystem(eqx.Module):
         assert isinstance(self.stabilization, Baumgarte)
         motion = Motion(self, t, y, args)
         alpha, beta = self.stabilization.alpha, self.stabilization.beta
-        rate = motion.equations.velocity(motion.t, motion.w, (motion.x, args))
-        p = motion.num_positions
-        stiffness = motion.bias.at[:p].add(
-            beta**2 * motion.equations.position(motion.t, motion.x, args)
-        )
-        a, _ = motion.solve(stiffness)
+        rate, p = motion.here.velocities(), motion.num_positions
+        a, _ = motion.solve(motion.bias.at[:p].add(beta**2 * motion.here.positions()))
         damping = motion.constrained(alpha * rate.at[:p].multiply(2))
         still = jax.tree_util.tree_map(jnp.zeros_like, y)
         field = y[1], motion.unravel(a), *self._auxiliary_rates(t, y, args)
         return field, (still[0], motion.unravel(-damping), *still[2:])
 
 
-def _check_arguments(
-    position_constraint: Any,
-    force: Any,
-    velocity_constraint: Any,
-    stabilization: Any,
-    auxiliary: Any,
-) -> None:
-    _check_force(force, auxiliary)
-    if position_constraint is not None:
-        check_function("position_constraint", position_constraint, "phi(t, q, args)")
-    if velocity_constraint is not None:
-        check_function("velocity_constraint", velocity_constraint, "a(t, q, v, args)")
-    if position_constraint is None and velocity_constraint is None:
-        raise ValueError(
-            "`position_constraint` is None and there is no `velocity_constraint`: without constraints use "
-            "`diffrax.ODETerm` and the solver alone."
-        )
-    if not isinstance(stabilization, Baumgarte | VelocityStabilization | None):
-        raise TypeError(
-            "`stabilization` must be `mj.Baumgarte(alpha, beta)` or `mj.VelocityStabilization()`, got "
-            f"{type(stabilization).__name__}. Others are arguments of `mj.Stabilized`."
-        )
-
-
 def _check_force(force: Any, auxiliary: Any) -> None:
     call = "Q(t, q, v, args)" if auxiliary is None else "Q(t, q, v, z, args)"
     check_function("force", force, call)
-
-
-def _check_auxiliary(auxiliary: Any, auxiliary_constraint: Any) -> None:
-    if auxiliary is not None:
-        check_function("auxiliary", auxiliary, "h(t, q, v, z, args)")
-    elif auxiliary_constraint is not None:
-        raise ValueError(
-            "`auxiliary_constraint` is for the states of `auxiliary`, which is None. Constraints on positions and "
-            "velocities are `position_constraint` and `velocity_constraint`."
-        )
-    if not isinstance(auxiliary_constraint, AbstractConstraint | None):
-        raise TypeError(
-            "`auxiliary_constraint` must be an `mj.Constraint` on z, or another one, got "
-            f"{type(auxiliary_constraint).__name__}. Write e.g. `mj.Constraint(lambda t, z, args: z @ z - 1.0)`."
-        )

@@ -219,7 +219,7 @@ class Closing:
 
 
 def _least_norm(J: Float[Array, "m n"], b: Float[Array, " m"]) -> Float[Array, " n"]:
-    return J.T @ pseudo_invert(J @ J.T, equilibrated=True, dependent=DEPENDENT_TRACED).solve(b)
+    return J.T @ pseudo_invert(J @ J.T, DEPENDENT_TRACED).solve(b)
 
 
 def _closed(x: np.ndarray) -> float:

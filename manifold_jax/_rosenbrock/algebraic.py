@@ -71,7 +71,7 @@ class Equations(NamedTuple):
     mass: Callable[[RealScalarLike, Float[Array, " n"]], Float[Array, "..."]]
 
     def at(self, t: RealScalarLike, x: Float[Array, " n"]) -> Linearized:
-        f, M = self.field(t, x), _as_matrix(self.mass(t, x), x.size)
+        f, M = self.field(t, x), as_matrix(self.mass(t, x), x.size)
         size = jax.lax.stop_gradient(jnp.max(jnp.abs(M), axis=1))
         D = jnp.where(size > 0, 1 / jnp.where(size > 0, size, 1), 1)
         M = D[:, None] * M
@@ -79,7 +79,7 @@ class Equations(NamedTuple):
         z = inverse @ (D * f)
 
         def rest(t: RealScalarLike, x: Float[Array, " n"]) -> Float[Array, " n"]:
-            return D * (self.field(t, x) - _as_matrix(self.mass(t, x), x.size) @ z)
+            return D * (self.field(t, x) - as_matrix(self.mass(t, x), x.size) @ z)
 
         t = jnp.asarray(t, jnp.result_type(float, t))
         K = P @ jax.jacfwd(rest, argnums=1)(t, x)
@@ -102,7 +102,8 @@ class Equations(NamedTuple):
         )
 
 
-def _as_matrix(mass: Float[Array, "..."], n: int) -> Float[Array, "n n"]:
+def as_matrix(mass: Float[Array, "..."], n: int) -> Float[Array, "n n"]:
+    """A mass in any of its forms."""
     return mass if mass.ndim == 2 else jnp.diag(jnp.broadcast_to(mass, (n,)))
 
 
@@ -115,9 +116,8 @@ def _null_space(
     if diagonal:
         d = jnp.diagonal(M)
         zero = d == 0
-        return jnp.diag(jnp.where(zero, 0, 1 / jnp.where(zero, 1, d))), jnp.diag(
-            zero.astype(M.dtype)
-        )
+        inverse = jnp.diag(jnp.where(zero, 0, 1 / jnp.where(zero, 1, d)))
+        return inverse, jnp.diag(zero.astype(M.dtype))
     M = jnp.where(jnp.all(jnp.isfinite(M)), M, jnp.eye(n, dtype=M.dtype))
     inverse = jnp.linalg.pinv(M, rtol=10 * unit)
     P = jnp.eye(n, dtype=M.dtype) - M @ inverse
@@ -197,16 +197,8 @@ def consistent(
 
     unknown, yes = jnp.asarray(jnp.inf, x.dtype), jnp.asarray(True)
     # Compiled once: the start, too, is met in the loop.
-    before = _Iterate(
-        fixed,
-        jnp.zeros_like(fixed),
-        unknown,
-        unknown,
-        unknown,
-        jnp.asarray(-1, jnp.int32),
-        yes,
-        yes,
-    )
+    none, first = jnp.zeros_like(fixed), jnp.asarray(-1, jnp.int32)
+    before = _Iterate(fixed, none, unknown, unknown, unknown, first, yes, yes)
     end = jax.lax.while_loop(unfinished, advance, before)
     # Where equations are badly conditioned steps end at many units of rounding.
     success = (end.size <= 1e3 * unit) | (end.residual <= 10 * unit)

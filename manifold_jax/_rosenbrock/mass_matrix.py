@@ -12,12 +12,12 @@ from jaxtyping import Array, Float
 
 from .._base.errors import clear_errors
 from .._base.numbers import numbers_as_arrays
+from .._base.shapes import are_alike, shapes
 from .._base.types import Args, RealScalarLike, Y
 from .._base.user_functions import check_function
 from .._constraint.checks import check_state
 from .._constraint.diagnosis import Diagnosis
 from .._constraint.projection_info import ProjectionInfo
-from .._linalg.rows import multiply
 from .algebraic import consistent, Equations, faults_of_start
 
 
@@ -108,8 +108,7 @@ class MassMatrixTerm(dfx.AbstractTerm):
         return unravel(self.equations(y, args).at(t, x).derivative)
 
     def equations(self, y: Y, args: Args) -> Equations:
-        """Return the equations in the vector of all numbers of the state; `y` is an example of
-        one."""
+        """The equations in the vector of all numbers of the state; `y` is an example of one."""
         _, unravel = jfu.ravel_pytree(y)
 
         def field(t: RealScalarLike, x: Float[Array, " n"]) -> Float[Array, " n"]:
@@ -136,12 +135,14 @@ def _consistent_state(
 
 def ravelled_like(y: Y, value: Any) -> Float[Array, " n"]:
     """What a vector field returned, as a vector; refused if it is not like the state."""
-    shapes = lambda tree: jtu.tree_map(jnp.shape, tree)
-    same = jtu.tree_structure(value) == jtu.tree_structure(y)
-    if not same or jtu.tree_leaves(shapes(value)) != jtu.tree_leaves(shapes(y)):
+    if not are_alike(value, y):
         raise ValueError(
             f"`vector_field` must return what `y` is made of, arrays of the shapes {shapes(y)}, got {shapes(value)}."
         )
+    return _ravelled(y, value)
+
+
+def _ravelled(y: Y, value: Any) -> Float[Array, " n"]:
     cast = lambda leaf, v: jnp.asarray(v, jnp.result_type(leaf))
     return jfu.ravel_pytree(jtu.tree_map(cast, y, value))[0]
 
@@ -155,11 +156,8 @@ def mass_values(mass: Any, t: RealScalarLike, y: Y, args: Args) -> Float[Array, 
     n = x.size
     if eqx.is_array_like(mass) and jnp.shape(mass) in ((), (n,), (n, n)):
         return jnp.asarray(mass, x.dtype)
-    shapes = lambda tree: jtu.tree_map(jnp.shape, tree)
-    same = jtu.tree_structure(mass) == jtu.tree_structure(y)
-    if same and jtu.tree_leaves(shapes(mass)) == jtu.tree_leaves(shapes(y)):
-        cast = lambda leaf, M: jnp.asarray(M, jnp.result_type(leaf))
-        return jfu.ravel_pytree(jtu.tree_map(cast, y, mass))[0]
+    if are_alike(mass, y):
+        return _ravelled(y, mass)
     raise ValueError(
         f"`mass` must be a scalar, a diagonal of shape ({n},) or of the shapes of y, or a matrix of shape ({n}, {n}) "
         f"for y of {n} numbers of shapes {shapes(y)}, got {shapes(mass)}."
@@ -179,8 +177,3 @@ def _check_numbers(mass: Any) -> None:
             )
     if not leaves:
         raise TypeError("`mass` is empty. Without a mass matrix use `diffrax.ODETerm(f)`.")
-
-
-def product(mass: Float[Array, "..."], v: Float[Array, " n"]) -> Float[Array, " n"]:
-    """`M v`."""
-    return multiply(mass, v) if mass.ndim == 2 else mass * v

@@ -11,14 +11,14 @@ import jax.tree_util as jtu
 from diffrax import RESULTS
 from jaxtyping import Array, Float
 
-from .._base.compat import is_okay, is_sde, nonlinear_failure, time_direction, undirected
+from .._base.compat import is_okay, is_sde, nonlinear_failure, undirected
 from .._base.rejection import is_repeatable, rejecting
 from .._base.types import Args, BoolScalar, FloatScalar, RealScalarLike, Y
 from .._constraint.checks import check_state
 from .._linalg.pivoted import LARGEST_WRITTEN_OUT
 from .algebraic import is_consistent
 from .stages import rosenbrock_step
-from .system import mass_matrix_term, System
+from .system import System
 from .tableau import RODAS3P, RODAS5P, RosenbrockTableau
 
 
@@ -64,8 +64,9 @@ class AbstractRosenbrock(dfx.AbstractAdaptiveSolver):
     linear system, all with the matrix `M / gamma - h df/dy`, which is factored once per step."""
 
     tableau: eqx.AbstractClassVar[RosenbrockTableau]
-    checks_start: eqx.AbstractVar[bool]  # not where the state has been made consistent before
-    largest_written_out: eqx.AbstractVar[int]  # number of rows that LAPACK does not factor
+    checks_start: bool = True  # not where the state has been made consistent before
+    # Number of rows up to which LAPACK does not factor.
+    largest_written_out: int = eqx.field(default=LARGEST_WRITTEN_OUT, static=True)
 
     term_structure: ClassVar = dfx.AbstractTerm
     interpolation_cls: ClassVar[Callable[..., RosenbrockInterpolation]] = RosenbrockInterpolation
@@ -82,15 +83,14 @@ class AbstractRosenbrock(dfx.AbstractAdaptiveSolver):
         check_state(y0)
         _check_terms(terms)
         derivative, usable = None, jnp.asarray(True)
-        term = mass_matrix_term(terms)
-        if term is not None:
-            direction = time_direction(terms)
+        system = System.of(terms, t0, t1, y0, args)
+        if system.mass is not None:
             x, _ = jfu.ravel_pytree(y0)
-            start = term.equations(y0, args).at(t0 * direction, x)
+            start, derivative = system.at_start(x)
             if self.checks_start:
                 usable = is_consistent(x, start)
-            if callable(term.mass):
-                derivative = start.derivative * jnp.asarray(direction, x.dtype)
+            if not callable(system.mass.mass):
+                derivative = None
         return RosenbrockState(jnp.abs(jnp.asarray(t1) - t0), derivative, usable)
 
     def step(
@@ -156,8 +156,6 @@ class Rodas5P(AbstractRosenbrock):
     """
 
     tableau: ClassVar[RosenbrockTableau] = RODAS5P
-    checks_start: bool = True
-    largest_written_out: int = eqx.field(default=LARGEST_WRITTEN_OUT, static=True)
 
 
 class Rodas3P(AbstractRosenbrock):
@@ -172,8 +170,6 @@ class Rodas3P(AbstractRosenbrock):
     """
 
     tableau: ClassVar[RosenbrockTableau] = RODAS3P
-    checks_start: bool = True
-    largest_written_out: int = eqx.field(default=LARGEST_WRITTEN_OUT, static=True)
 
 
 def _check_terms(terms: Any) -> None:

@@ -9,8 +9,10 @@ from jaxtyping import Array, Float
 
 from .._base.types import BoolScalar
 from .._jaxpr.trace import num_equations
-from .._linalg.pivoted import factorize_pivoted, PivotedFactorization
-from .mass_matrix import product
+from .._linalg.dense import Factorization
+from .._linalg.pivoted import factorize_pivoted
+from .._linalg.rows import product
+from .algebraic import as_matrix
 from .system import System, Vector
 from .tableau import RosenbrockTableau, Row
 
@@ -54,7 +56,8 @@ def rosenbrock_step(
     Z0 = None if derivative is None else h * derivative
     f0, J, T = system.linearized(x0, Z0)
     M0 = system.mass_at(system.t0, x0)
-    factor = factorize_pivoted(_iteration_matrix(M0, tableau.gamma, J), largest_written_out)
+    mass = as_matrix(jnp.ones((), J.dtype) if M0 is None else M0, x0.size)
+    factor = factorize_pivoted(mass / tableau.gamma - J, largest_written_out)
     stages = _Stages(tableau, system, factor, x0, Z0, M0, T)
     U, V = stages.in_a_loop(f0) if stages.are_long else stages.written_out(f0)
     finite = [jnp.all(jnp.isfinite(value)) for value in (f0, J, T)]
@@ -66,7 +69,7 @@ def rosenbrock_step(
         tuple(_plus(None, weights, U) for weights in tableau.dense),
         after,
         finite[0] & finite[1] & finite[2],
-        factor.regular,
+        factor.full_rank,
     )
 
 
@@ -75,7 +78,7 @@ class _Stages(NamedTuple):
 
     tableau: RosenbrockTableau
     system: System
-    factor: PivotedFactorization
+    factor: Factorization
     x0: Vector
     Z0: Vector | None
     M0: Float[Array, "..."] | None
@@ -143,15 +146,6 @@ class _Stages(NamedTuple):
         xs = (jnp.arange(1, count), times, padded(tableau.a_lower), padded(tableau.c_lower), d)
         U, V = jax.lax.scan(stage, start, xs)[0]
         return list(U), [] if V is None else list(V)
-
-
-def _iteration_matrix(
-    M: Float[Array, "..."] | None, gamma: float, J: Float[Array, "n n"]
-) -> Float[Array, "n n"]:
-    """`M / gamma - J`."""
-    n = J.shape[0]
-    M = jnp.ones((), J.dtype) if M is None else M
-    return (M if M.ndim == 2 else jnp.diag(jnp.broadcast_to(M, (n,)))) / gamma - J
 
 
 def _without_zeros(row: Row) -> Row:

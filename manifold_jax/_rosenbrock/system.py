@@ -10,7 +10,9 @@ from jaxtyping import Array, Float
 
 from .._base.compat import directed, time_direction, undirected
 from .._base.types import Args, RealScalarLike, Y
-from .mass_matrix import mass_values, MassMatrixTerm, product, ravelled_like
+from .._linalg.rows import product
+from .algebraic import Linearized
+from .mass_matrix import mass_values, MassMatrixTerm, ravelled_like
 
 
 Vector = Float[Array, " n"]
@@ -32,9 +34,10 @@ class System(NamedTuple):
 
     @staticmethod
     def of(terms: Any, t0: RealScalarLike, t1: RealScalarLike, y0: Y, args: Args) -> "System":
-        mass = mass_matrix_term(terms)
-        if mass is not None:
-            terms = directed(dfx.ODETerm(mass.vector_field), time_direction(terms))
+        mass = undirected(terms)
+        if not isinstance(mass, MassMatrixTerm):
+            return System(terms, None, t0, t1, y0, args)
+        terms = directed(dfx.ODETerm(mass.vector_field), time_direction(terms))
         return System(terms, mass, t0, t1, y0, args)
 
     @property
@@ -74,23 +77,18 @@ class System(NamedTuple):
         _, T = jax.jvp(lambda t: rest(t, x0)[0], (t0,), (self.step.astype(t0.dtype),))
         return f0, J, T
 
+    def at_start(self, x0: Vector) -> tuple[Linearized, Vector]:
+        """The equations with their mass matrix at the beginning, and `y'` in the direction of the
+        step."""
+        direction = time_direction(self.terms)
+        at = self.mass.equations(self.y0, self.args).at(self.t0 * direction, x0)  # pyright: ignore
+        return at, at.derivative * jnp.asarray(direction, x0.dtype)
+
     def refreshed(self, made_jump: Any, derivative: Vector | None, x0: Vector) -> Vector | None:
         """The carried derivative `y'`, computed anew behind a jump of the field."""
         if derivative is None or made_jump is False:
             return derivative
-        direction = time_direction(self.terms)
-
-        def compute() -> Vector:
-            at = self.mass.equations(self.y0, self.args).at(self.t0 * direction, x0)  # pyright: ignore
-            return at.derivative * jnp.asarray(direction, x0.dtype)
-
-        return jax.lax.cond(made_jump, compute, lambda: derivative)
+        return jax.lax.cond(made_jump, lambda: self.at_start(x0)[1], lambda: derivative)
 
     def _unravel(self, x: Vector) -> Y:
         return jfu.ravel_pytree(self.y0)[1](x)
-
-
-def mass_matrix_term(terms: Any) -> MassMatrixTerm | None:
-    """Return the term of an equation with a mass matrix, also if time is negated."""
-    inner = undirected(terms)
-    return inner if isinstance(inner, MassMatrixTerm) else None

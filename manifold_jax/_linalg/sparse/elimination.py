@@ -24,8 +24,7 @@ _ONE_LOOP = 64
 
 class Blocks(NamedTuple):
     """The blocks of a block tridiagonal matrix, `lower[b]` beside `diagonal[b]` to the left of it,
-    `upper[b]` to
-    the right. The first lower and the last upper one are zero."""
+    `upper[b]` to the right. The first lower and the last upper one are zero."""
 
     lower: Float[Array, "b w w"]
     diagonal: Float[Array, "b w w"]
@@ -65,10 +64,7 @@ class InOneLoop(eqx.Module):
     @staticmethod
     def of(blocks: Blocks) -> "InOneLoop":
         def step(before, block):
-            (right, upper), (L, D, U) = before, block
-            multiplier = times(L, right)
-            pivot = Pivot.of(D - times(multiplier, upper))
-            upper = times(pivot.left, U)
+            pivot, multiplier, upper = _next_pivot(*before, *block)
             return (pivot.right, upper), (pivot, multiplier, upper)
 
         nothing = jnp.zeros_like(blocks.diagonal[0])
@@ -76,9 +72,8 @@ class InOneLoop(eqx.Module):
         return InOneLoop(pivots, times(pivots.left, lower), times(pivots.right, upper))
 
     def solve(self, r: Float[Array, "b w"]) -> Float[Array, "b w"]:
-        nothing = jnp.zeros_like(r[0])
-        y = _forwards(self.lower, apply(self.pivots.left, r), nothing)
-        return _backwards(self.upper, apply(self.pivots.right, y), nothing)
+        y = _substitute(self.lower, apply(self.pivots.left, r))
+        return _substitute(self.upper, apply(self.pivots.right, y), backwards=True)
 
 
 class InChunks(eqx.Module):
@@ -92,7 +87,7 @@ class InChunks(eqx.Module):
     after: Float[Array, "k c w w"]
     last_multiplier: Float[Array, "c w w"]
     last_upper: Float[Array, "c w w"]
-    last: "InOneLoop | InChunks"
+    last: "Tridiagonal | InOneLoop | InChunks"
 
     @staticmethod
     def of(blocks: Blocks) -> "InChunks":
@@ -104,10 +99,9 @@ class InChunks(eqx.Module):
 
         def inwards(before, block):
             """Forwards; `fill` is what couples a block to the last one of the chunk before."""
-            (right, upper, fill), (L, D, U) = before, block
-            multiplier = times(L, right)
-            pivot = Pivot.of(D - times(multiplier, upper))
-            upper, fill = times(pivot.left, U), -times(pivot.left, times(multiplier, fill))
+            *before, fill = before
+            pivot, multiplier, upper = _next_pivot(*before, *block)
+            fill = -times(pivot.left, times(multiplier, fill))
             return (pivot.right, upper, fill), (pivot, multiplier, upper, fill)
 
         nothing, minus = jnp.zeros_like(D[0]), jnp.broadcast_to(-eye, D[0].shape)
@@ -129,25 +123,27 @@ class InChunks(eqx.Module):
             return both, both
 
         _, (before, after) = jax.lax.scan(outwards, (nothing, minus), (uppers, fills), reverse=True)
-        last = Blocks(
-            last_lower,
-            last_diagonal - times(U[-1], _after(before[0])),
-            -times(U[-1], _after(after[0])),
-        )
-        last = InOneLoop.of(last) if last_diagonal.shape[0] <= _ONE_LOOP else InChunks.of(last)
+        last_diagonal = last_diagonal - times(U[-1], _after(before[0]))
+        last = eliminate(Blocks(last_lower, last_diagonal, -times(U[-1], _after(after[0]))))
         return InChunks(pivots, lower, uppers, before, after, multiplier, U[-1], last)
 
     def solve(self, r: Float[Array, "b w"]) -> Float[Array, "b w"]:
         number, width = r.shape
         chunks = _chunks(r, jnp.zeros_like(r[0]))
-        nothing = jnp.zeros_like(chunks[0])
-        y = _forwards(self.lower, apply(self.pivots.left, chunks[:-1]), nothing)
-        g = _backwards(self.upper, apply(self.pivots.right, y), nothing)
+        y = _substitute(self.lower, apply(self.pivots.left, chunks[:-1]))
+        g = _substitute(self.upper, apply(self.pivots.right, y), backwards=True)
         end = chunks[-1] - apply(self.last_multiplier, y[-1])
         s = self.last.solve(end - apply(self.last_upper, _after(g[0])))
         x = g - apply(self.before, _before(s)[None]) - apply(self.after, s[None])
         x = jnp.concatenate([x, s[None]])
         return jnp.swapaxes(x, 0, 1).reshape(-1, width)[:number]
+
+
+def _next_pivot(right, upper, L, D, U):
+    """Of a block `L, D, U`, its multiplier and `upper`, from those before."""
+    multiplier = times(L, right)
+    pivot = Pivot.of(D - times(multiplier, upper))
+    return pivot, multiplier, times(pivot.left, U)
 
 
 def _chunks(A: Float[Array, "b ..."], fill: Float[Array, "..."]) -> Float[Array, "k c ..."]:
@@ -159,22 +155,16 @@ def _chunks(A: Float[Array, "b ..."], fill: Float[Array, "..."]) -> Float[Array,
     return jnp.swapaxes(A, 0, 1)
 
 
-def _forwards(multiplier, r, start):
+def _substitute(factors, r, backwards: bool = False):
+    """`x_b = r_b - factors_b x_{b-1}`, or `x_{b+1}`."""
+
     def step(before, block):
-        multiplier, r = block
-        r = r - apply(multiplier, before)
-        return r, r
-
-    return jax.lax.scan(step, start, (multiplier, r))[1]
-
-
-def _backwards(upper, r, start):
-    def step(after, block):
-        upper, r = block
-        x = r - apply(upper, after)
+        factor, r = block
+        x = r - apply(factor, before)
         return x, x
 
-    return jax.lax.scan(step, start, (upper, r), reverse=True)[1]
+    start = jnp.zeros(r.shape[1:], r.dtype)
+    return jax.lax.scan(step, start, (factors, r), reverse=backwards)[1]
 
 
 def _after(A: Array) -> Array:

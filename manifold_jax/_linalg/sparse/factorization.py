@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..._base.types import BoolScalar, FloatScalar
+from ..newton import without_derivative
 from ..rows import AbstractRows
 from .elimination import Blocks, eliminate
 from .structure import Structure
@@ -16,8 +17,7 @@ from .structure import Structure
 
 class BlockFactorization(eqx.Module):
     """A factorization with a flag that says whether a system with a known solution is solved to
-    some digits: not if
-    the rank is not full, nor if an entry is missing in the structure.
+    some digits: not if the rank is not full, nor if an entry is missing in the structure.
 
     The derivative is that of `G V x = b`, whatever the elimination does.
     """
@@ -34,7 +34,7 @@ class BlockFactorization(eqx.Module):
     def of(
         rows, directions, structure: Structure, symmetric: bool, checked: bool
     ) -> "BlockFactorization":
-        fixed_rows, fixed_directions = _fixed(rows), _fixed(directions)
+        fixed_rows, fixed_directions = without_derivative((rows, directions))
         product = lambda z: fixed_rows.multiply(fixed_directions.combine(z))
         blocks = _blocks(product, structure, fixed_rows.x.dtype)
         factorization = BlockFactorization(
@@ -95,15 +95,9 @@ class BlockFactorization(eqx.Module):
         return error <= float(jnp.finfo(lengths.dtype).eps) ** (1 / 4)
 
 
-def _fixed(rows: Any) -> Any:
-    hold = lambda leaf: jax.lax.stop_gradient(leaf) if eqx.is_inexact_array(leaf) else leaf
-    return jax.tree_util.tree_map(hold, rows)
-
-
 def _places(structure: Structure) -> Array:
     """Return the places of the equations in the order of elimination. Behind a barrier, as the
-    compiler would evaluate
-    what follows from it by itself, slowly."""
+    compiler would evaluate what follows from it by itself, slowly."""
     if structure.place is None:
         return jax.lax.optimization_barrier(jnp.arange(structure.num_equations, dtype=jnp.int32))
     return jax.lax.optimization_barrier(jnp.asarray(structure.place))

@@ -24,8 +24,7 @@ _FULL = 0.25
 
 def dependence(function: Callable, x: Float[Array, " n"]) -> sp.csr_matrix | None:
     """Return the dependence of `function(x)`, a vector: `(m, n)` with a one where equation `i`
-    depends on unknown `j`, for
-    any values. `None` if most equations depend on very many."""
+    depends on unknown `j`, for any values. `None` if most equations depend on very many."""
     n = x.size
     if n <= _GROUPS * _HASHES:
         return sp.csr_matrix(incidence(function, (x, np.eye(n, dtype=bool))).depends)

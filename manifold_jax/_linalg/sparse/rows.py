@@ -1,7 +1,7 @@
 """The rows of a Jacobian as a linear map, without its entries."""
 
 from collections.abc import Callable
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -10,14 +10,9 @@ from jaxtyping import Array, Float
 
 from ..._base.closure import convert_closure
 from ..._base.types import Args
-from ..rows import AbstractRows
+from ..rows import AbstractRows, Metric
 from .factorization import BlockFactorization
 from .structure import Structure
-
-
-@runtime_checkable
-class Metric(Protocol):
-    def solve(self, rows: Float[Array, " n"]) -> Float[Array, " n"]: ...
 
 
 class SparseRows(AbstractRows):

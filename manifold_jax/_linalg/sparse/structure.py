@@ -11,6 +11,7 @@ import scipy.sparse as sp
 from jaxtyping import Array, Float
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
+from ..coloring import greedy_colors
 from .pattern import dependence
 
 
@@ -36,7 +37,7 @@ class Structure:
     """
 
     def __init__(self, depends: sp.csr_matrix, per_block: int):
-        self.num_equations, self.num_unknowns = depends.shape  # pyright: ignore[reportGeneralTypeIssues]
+        self.num_equations: int = depends.shape[0]  # pyright: ignore[reportOptionalSubscript]
         self._depends, self._per_block = depends, per_block
         blocks = _merged(depends, per_block)
         coupled = (blocks @ blocks.T).tocoo()
@@ -59,7 +60,7 @@ class Structure:
 
     @functools.cached_property
     def color(self) -> np.ndarray:
-        return _colored(self._depends)
+        return greedy_colors(self._depends.T @ self._depends)
 
     @property
     def num_colors(self) -> int:
@@ -125,8 +126,7 @@ _MOST_FOUND = 64
 
 def structure_of(equations: Any, per_block: int = 1) -> Structure | None:
     """Return the structure as for `choose_structure`, if there is any. Found once for each traced
-    program, which is
-    evaluated in many places."""
+    program, which is evaluated in many places."""
     key = per_block, *(_program(function, x) for function, x in equations)
     if key not in _FOUND:
         patterns = [dependence(function, x) for function, x in equations]
@@ -177,18 +177,3 @@ def _width(coupled: sp.coo_matrix, place: np.ndarray) -> int:
     band = max(1, int(np.abs(i - j).max(initial=1)))
     fits = lambda width: np.abs(i // width - j // width).max(initial=0) <= 1
     return next(width for width in range((band + 1) // 2, band + 1) if fits(width))
-
-
-def _colored(depends: sp.csr_matrix) -> np.ndarray:
-    """Greedily (Curtis, Powell & Reid, J. Inst. Maths Applics 13 (1974) 117-119)."""
-    by_column = depends.tocsc()
-    taken: list[set[int]] = [set() for _ in range(depends.shape[0])]  # pyright: ignore[reportOptionalSubscript]
-    colors = np.zeros(depends.shape[1], np.int32)  # pyright: ignore[reportOptionalSubscript]
-    for j in range(depends.shape[1]):  # pyright: ignore[reportOptionalSubscript]
-        rows = by_column.indices[by_column.indptr[j] : by_column.indptr[j + 1]]
-        used = functools.reduce(set.union, [taken[i] for i in rows], set())
-        color = next(color for color in range(len(used) + 1) if color not in used)
-        colors[j] = color
-        for i in rows:
-            taken[i].add(color)
-    return colors

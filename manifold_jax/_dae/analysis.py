@@ -1,0 +1,120 @@
+"""All that is known of a system before it is evaluated."""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from .._base.types import Args
+from .aliases import Aliases, lifted
+from .compressed import Compressed
+from .derivatives import pick, total_derivatives
+from .equations import Equations
+from .layout import Layout
+from .occurrence import Example, Occurrence
+from .pivots import Elimination
+from .samples import Samples
+from .signature import signature, Structure
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Analysis:
+    """What follows from the occurrence of the unknowns. Compared by identity.
+
+    - `written`: the structure of all equations.
+    - `unlifted`: that of the equations that are left, with the fewest differentiations.
+    - `implicit`: whether these may be nonlinear in the leading derivatives.
+    """
+
+    example: Example
+    occurrence: Occurrence
+    written: Structure
+    unlifted: Structure
+    layout: Layout
+    entries: Compressed
+    implicit: bool
+
+    @staticmethod
+    def of(example: Example, occurrence: Occurrence, implicit: bool) -> "Analysis | None":
+        """`None` if the structure is singular."""
+        written = Structure.of(signature(occurrence.there))
+        if written is None:
+            return None
+        aliases, order = Aliases.of(example, occurrence), example.equations.order
+        there = aliases.merged(occurrence.there)
+        unlifted = Structure.of(signature(there))
+        assert unlifted is not None
+        structure = unlifted if implicit else lifted(example, aliases, unlifted)
+        layout = Layout.of(structure, aliases, order)
+        entries = Compressed.of(structure, aliases, there, order + 1)
+        return Analysis(example, occurrence, written, unlifted, layout, entries, implicit)
+
+    @property
+    def c(self) -> np.ndarray:
+        """How often each of the equations that are left is differentiated."""
+        return self.layout.structure.c
+
+    @property
+    def rows(self) -> np.ndarray:
+        """The equations that are left."""
+        return self.layout.aliases.rows
+
+    @functools.cached_property
+    def samples(self) -> Samples:
+        states = self.layout.num_states
+
+        def matrix(t: Array, y: Array, args: Args) -> Array:
+            jets = self.jets(y[:states], y[states:] if self.implicit else None, 0)
+            return self.entries.matrix(
+                self.entries.derivatives(self.example.residual, t, jets, args)
+            )
+
+        return Samples.of(jax.jit(matrix), self.example, self.layout)
+
+    @functools.cached_property
+    def elimination(self) -> Elimination:
+        structure = self.layout.structure
+        level = np.maximum(structure.sigma, 0)[:, None, :]
+        varies = self.layout.aliases.merged(self.occurrence.varies)
+        varies = np.take_along_axis(varies, level, axis=1)[:, 0]
+        return Elimination.of(structure.leading & ~varies, self.samples.matrices)
+
+    def jets(
+        self, z: Float[Array, " a"], w: Float[Array, " b"] | None, differentiations: int
+    ) -> tuple[Float[Array, " n"], ...]:
+        """The derivatives of all unknowns that equations contain when they are differentiated so often,
+        as far as they are known; else zero."""
+        number = self.example.equations.order + 1 + differentiations
+        return tuple(self.layout.jet(k)(z, w) for k in range(number))
+
+    def jets_of_states(
+        self, z: Float[Array, " a"], w: Float[Array, " b"] | None, differentiations: int
+    ) -> tuple[Array, ...]:
+        """Return the derivatives for equations of states alone. The others, evaluated with them,
+        have to stay finite, and of moderate size where they cancel: for unknowns that are not states
+        those in `w` are taken, without derivatives, or the example."""
+        x, *others = self.jets(z, None, differentiations)
+        known = self.layout.jet(0).index
+        known = (known >= 0) & (known < self.layout.num_states)
+        rest = jnp.asarray(self.example.jets[0], x.dtype)
+        if w is not None:
+            rest = self.layout.jet(0)(jnp.zeros_like(z), jax.lax.stop_gradient(w))
+        return jnp.where(known, x, rest), *others
+
+    def differentiated(
+        self,
+        equations: Equations,
+        t: Array,
+        jets: tuple[Array, ...],
+        args: Args,
+        first: np.ndarray | int,
+        end: np.ndarray,
+    ) -> Float[Array, " m"]:
+        """`F_i^(k)` for `first_i <= k < end_i`, lower derivatives first."""
+        number = int(end.max(initial=1))
+        levels = total_derivatives(equations, t, jets, args, number - 1)
+        parts = [pick(levels[k], self.rows[(first <= k) & (k < end)]) for k in range(number)]
+        return jnp.concatenate(parts)

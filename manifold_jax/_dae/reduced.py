@@ -1,0 +1,126 @@
+"""A reduced system: its vector field, its manifold, and all unknowns."""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.flatten_util as jfu
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from .._base.shapes import shapes
+from .._base.types import Args, BoolScalar, RealScalarLike, Y
+from .._constraint.checks import check_state
+from .._constraint.constraint import AbstractConstraint
+from .._constraint.residual import as_time
+from .._linalg.newton import implicit_root
+from .analysis import Analysis
+from .equations import Equations
+from .highest_derivatives import HighestDerivatives
+
+
+_SINGULAR = (
+    "The equations of `F` do not determine all derivatives at `{y}`: some of them depend on the others there "
+    "(redundant), or `{y}` is a singular configuration. `dae.consistent_state`, called outside of `jit`, says which."
+)
+
+
+class Reduced(eqx.Module):
+    """Equations with their analysis, all that the parts of a system share."""
+
+    equations: Equations
+    analysis: Analysis = eqx.field(static=True)
+
+    def closing(self, t: Any, z: Array, args: Args) -> HighestDerivatives:
+        return HighestDerivatives(self.equations, as_time(t, z.dtype), z, args, self.analysis)
+
+    def split(self, y: Y) -> tuple[Array, Array | None]:
+        """The state `z`, and the leading derivatives where they belong to it. Refuses what is no state,
+        such as the unknowns of the user's equations."""
+        check_state(y, "z")
+        states, implicit = self.analysis.layout.num_states, self.analysis.implicit
+        size = states + len(self.analysis.c) * implicit
+        if not eqx.is_array_like(y) or jnp.shape(y) != (size,):
+            raise ValueError(
+                f"The state of a reduced system is one vector of shape ({size},), with the names in `dae.report.states`; "
+                f"got {shapes(y)}. `dae.consistent_state` makes one from a guess of x; of many states take `jax.vmap`."
+            )
+        return (y[:states], y[states:]) if implicit else (y, None)
+
+    def field(self, t: RealScalarLike, y: Float[Array, " states"], args: Args) -> Array:
+        """The vector field on the state.
+
+        In the form of index 1 the leading derivatives are unknowns `w` of their own behind the state,
+
+            z' = (z, w),   0 = F_i^(c_i)(t, z, w),
+
+        so that equations nonlinear in them need neither be differentiated once more nor solved in the
+        vector field: a Rosenbrock method does both at once.
+        """
+        z, w = self.split(y)
+        closing, rate = self.closing(t, z, args), self.analysis.layout.rate()
+        if w is None:
+            return rate(z, closing.solve())
+        return jnp.concatenate([rate(z, w), closing.residual(w)])
+
+    def hidden_constraints(
+        self,
+        t: RealScalarLike,
+        z: Float[Array, " a"],
+        args: Args,
+        first: np.ndarray | int,
+        end: np.ndarray,
+        w: Float[Array, " n"] | None = None,
+    ) -> Float[Array, " m"]:
+        """`F_i^(k)` for `first_i <= k < end_i`. Leading derivatives `w` like those that belong to `z` are
+        for the size of what cancels in combinations of equations. Without these the example serves better:
+        there all that these equations do not depend on is known to be finite, with its slopes."""
+        order = int(end.max(initial=0)) - 1
+        if order < 0:
+            return jnp.zeros((0,), z.dtype)
+        w = w if self.equations.combinations else None
+        jets, t = self.analysis.jets_of_states(z, w, order), as_time(t, z.dtype)
+        return self.analysis.differentiated(self.equations, t, jets, args, first, end)
+
+    def unknowns_with_derivatives(
+        self, t: RealScalarLike, y: Float[Array, " states"], args: Args, number: int
+    ) -> list[Float[Array, " n"]]:
+        """`x, x', ...` up to that derivative, by differentiating along the solution."""
+        layout = self.analysis.layout
+        z, w = self.split(y)
+        w = self.closing(t, z, args).solve() if w is None else w
+
+        def leading(t: Array, z: Array) -> Array:
+            """Solved for only once: nearby, the same as the function that the equations define."""
+            return implicit_root(self.closing(t, z, args), w)
+
+        def differentiated(function: Callable) -> Callable:
+            along = lambda t, z: (jnp.ones_like(t), layout.rate()(z, leading(t, z)))
+            return lambda t, z: jax.jvp(function, (t, z), along(t, z))[1]
+
+        further = layout.most_beyond(number)
+        t, function, found = as_time(t, z.dtype), leading, []
+        for _ in range(further + 1):
+            found.append(function(t, z))
+            function = differentiated(function)
+        known = jnp.concatenate(found)
+        return [layout.jet(k, further)(z, known) for k in range(number + 1)]
+
+
+class ReducedConstraint(AbstractConstraint):
+    """`F_i = 0, F_i' = 0, ..., F_i^(c_i - 1) = 0`: what the equations and their derivatives say
+    of the state alone. Lower derivatives first. Built by `reduce_dae`."""
+
+    system: Reduced
+    redundant: bool = eqx.field(static=True, default=False)
+
+    def __call__(self, t: RealScalarLike, y: Y, args: Args = None) -> Float[Array, " m"]:
+        z, w = self.system.split(y)
+        return self.system.hidden_constraints(t, z, args, 0, self.system.analysis.c, w)
+
+    def faults(self, t, y, args=None) -> tuple[tuple[BoolScalar, str], ...]:
+        z, w = self.system.split(jfu.ravel_pytree(y)[0])
+        closing = self.system.closing(t, z, args)
+        return ((~closing.linearize(z if w is None else w).full_rank, _SINGULAR),)
