@@ -1,5 +1,6 @@
 """One correction: where it goes, what it reports, and its derivatives."""
 
+import diffrax as dfx
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -206,6 +207,23 @@ def test_failure_is_reported_and_leaves_the_point():
 def test_failure_raises(residual, message):
     with pytest.raises(RuntimeError, match=message):
         jax.jit(lambda y: mj.project(mj.Constraint(residual), 0.0, y))(jnp.array([0.3, 0.4]))
+
+
+def test_an_equation_that_ignores_the_state_among_redundant_ones():
+    """Its scaled residual overflows, and the rank of redundant equations is not asked for."""
+    g = mj.Constraint(lambda t, y, args: jnp.stack([y[0] - 1, 0 * y[1] + 5]), redundant=True)
+    with pytest.raises(RuntimeError, match="ignores y"):
+        mj.consistent_state(g, 0.0, jnp.array([1.0, 0.4]))
+
+
+@pytest.mark.parametrize("distance", [1e-14, 1e-12])
+def test_a_start_is_checked_to_rounding(distance):
+    y0 = jnp.array([1 + distance, 0.0])
+    hook = mj.Projected(dfx.Euler(), mj.Constraint(lambda t, y, args: y @ y - 1))
+    turn = dfx.ODETerm(lambda t, y, args: jnp.array([-y[1], y[0]]))
+    options = dict(consistent="check", throw=False)
+    sol = mj.diffeqsolve(turn, hook, 0.0, 0.1, 0.1, y0, **options)
+    assert (sol.result == dfx.RESULTS.successful) == (distance < 1e-13)
 
 
 def test_what_a_projection_did_is_printed():

@@ -47,6 +47,19 @@ def test_coefficients_belong_together(name):
     np.testing.assert_allclose(Gamma.sum(axis=1), tableau.d, rtol=0, atol=1e-13)
 
 
+@pytest.mark.parametrize("written_out", [4, 0], ids=["written out", "library"])
+def test_rows_are_exchanged(written_out):
+    """The equations of the algebraic unknowns are in the other order: zeros on the diagonal."""
+    term = mj.MassMatrixTerm(
+        lambda t, y, args: jnp.stack([y[1] - y[2], y[0] - 2 * y[2], -y[2]]),
+        jnp.diag(jnp.array([0.0, 0.0, 1.0])),
+    )
+    solver = mj.Rodas3P(largest_written_out=written_out)
+    y0 = jnp.array([2.0, 1.0, 1.0])
+    y = mj.diffeqsolve(term, solver, 0.0, 1.0, 0.01, y0).ys[-1]
+    np.testing.assert_allclose(y, np.exp(-1) * np.array([2, 1, 1]), rtol=1e-7)
+
+
 def forced(t, y, args):
     a, b = y
     return jnp.stack([-b * a + jnp.cos(t) * b + t**2, a**2 - jnp.sin(t) * b])
