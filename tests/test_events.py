@@ -74,6 +74,25 @@ def test_gradient_of_time_and_state_of_an_event(hook):
     assert reverse[0] == 0
 
 
+@pytest.mark.parametrize("solve", [mj.diffeqsolve, dfx.diffeqsolve])
+def test_gradient_of_an_event_by_the_field_and_the_start(solve):
+    """Through the interpolation of the step in which it happens: the angle asin 0.3 is reached at
+    `(asin 0.3 - a) / rate`, and the state there does not change."""
+    event = dfx.Event(lambda t, y, args, **kwargs: y[1] - 0.3, FINDER)
+    options = dict(event=event, adjoint=mj.StepReplayAdjoint())
+    options["stepsize_controller"] = dfx.PIDController(rtol=1e-9, atol=1e-9)
+    field = dfx.ODETerm(lambda t, y, args: args * jnp.stack([-y[1], y[0]]))
+    hook = mj.Projected(dfx.Tsit5(), CIRCLE)
+
+    def end(rate, a):
+        y0 = jnp.stack([jnp.cos(a), jnp.sin(a)])
+        sol = solve(field, hook, 0.0, 3.0, 0.01, y0, rate, **options)
+        return sol.ts[0] + 2 * sol.ys[0, 0]
+
+    slopes = jax.jit(jax.grad(end, (0, 1)))(2.0, 0.1)
+    np.testing.assert_allclose(slopes, [-(np.arcsin(0.3) - 0.1) / 4, -0.5], rtol=1e-6)
+
+
 @pytest.mark.parametrize("solver", [dfx.Tsit5(), mj.Rodas3P()], ids=["plain", "rosenbrock"])
 def test_events_without_a_hook_see_the_true_time_backwards(solver):
     """Diffrax alone shows them -2 at the start, and ends there."""

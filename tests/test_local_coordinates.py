@@ -207,12 +207,17 @@ def test_gradients(chart):
     np.testing.assert_allclose(reverse, differences, rtol=1e-7)
 
 
-def test_stage_failure_rejects_the_step_and_leaves_the_gradient_finite():
-    """The first step is far too long for the chart: there is no point of the sphere above it."""
+@pytest.mark.parametrize("adjoint", [mj.StepReplayAdjoint(), dfx.RecursiveCheckpointAdjoint()])
+def test_stage_failure_rejects_the_step_and_leaves_the_gradient_finite(adjoint):
+    """The first step is far too long for the chart: there is no point of the sphere above it. The
+    field is not defined off the manifold."""
+
+    def turning(t, y, args):
+        return jnp.stack([-args * y[1], args * y[0]]) + 0 * jnp.sqrt(1.2 - y @ y)
 
     def run(speed):
         sol = mj.diffeqsolve(
-            dfx.ODETerm(lambda t, y, args: jnp.stack([-args * y[1], args * y[0]])),
+            dfx.ODETerm(turning),
             mj.LocalCoordinates(dfx.Tsit5(), mj.Constraint(lambda t, y, args: y @ y - 1.0)),
             0.0,
             4.0,
@@ -220,6 +225,7 @@ def test_stage_failure_rejects_the_step_and_leaves_the_gradient_finite():
             jnp.array([1.0, 0.0]),
             speed,
             stepsize_controller=dfx.PIDController(rtol=1e-8, atol=1e-8),
+            adjoint=adjoint,
         )
         return sol.ys[0, 0], sol.stats["num_rejected_steps"]
 

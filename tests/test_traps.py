@@ -177,6 +177,32 @@ def test_nan_in_a_rejected_step_and_the_gradient():
     np.testing.assert_allclose(gradient, exact, rtol=1e-4)
 
 
+def test_nan_at_the_end_of_a_rejected_step_and_the_gradient():
+    """The stages of the first step are near the circle, its end is not, and neither the field nor g is
+    defined there. An adjoint that goes through rejected steps must not see it."""
+    defined = lambda y: 0.0 * jnp.sqrt(y @ y - 0.9)
+    terms = dfx.ODETerm(lambda t, y, args: args * TURN.vf(t, y, None) + defined(y))
+    hook = mj.Projected(dfx.Bosh3(), mj.Constraint(lambda t, y, args: y @ y - 1 + defined(y)))
+    options = dict(stepsize_controller=ADAPTIVE, adjoint=dfx.RecursiveCheckpointAdjoint())
+
+    def end(rate):
+        sol = mj.diffeqsolve(terms, hook, 0.0, 2.0, 2**0.5, START, rate, **options)
+        return sol.ys[0, 0], sol.stats["num_rejected_steps"]
+
+    gradient, rejected = jax.jit(jax.grad(end, has_aux=True))(1.0)
+    assert rejected > 0
+    np.testing.assert_allclose(gradient, -2 * np.sin(2.0), rtol=1e-4)
+
+
+def test_the_slope_of_dense_output_between_steps():
+    """Bending the interpolant to the corrected end leaves its slope there: that of the field."""
+    options = dict(saveat=dfx.SaveAt(dense=True), stepsize_controller=dfx.StepTo([0.0, 0.7, 1.4]))
+    sol = dfx.diffeqsolve(TURN, mj.Projected(dfx.Tsit5(), CIRCLE), 0.0, 1.4, None, START, **options)
+    field = TURN.vf(0.7, sol.evaluate(0.7), None)
+    for left in (True, False):
+        np.testing.assert_allclose(sol.derivative(0.7, left=left), field, rtol=0, atol=1e-12)
+
+
 def test_unreached_outputs_and_the_gradient():
     """Values after an event stay infinite, and do not turn the gradient into NaN."""
 

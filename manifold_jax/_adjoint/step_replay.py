@@ -19,6 +19,7 @@ from .._base.compat import (
     while_loop,
 )
 from .._base.derivative_rule import apply_linear, ForwardRule
+from .events import LocatingAdjoint
 from .fixed_steps import event_of_controller, SizesHeldFixed, with_end_held_fixed
 from .gradient import Ends, TimesBar, with_zeros
 from .record import Record, recording
@@ -80,7 +81,13 @@ class StepReplayAdjoint(dfx.AbstractAdjoint):
                 f"`checkpoints` must be a positive integer, got {self.checkpoints!r}: the number of states to record."
             )
 
-    def loop(
+    def loop(self, *, event, **given: Any) -> Any:
+        if event is not None and event.root_finder is not None:
+            # The time of the event is found after the steps, which alone are made again.
+            return LocatingAdjoint(self).loop(event=event, **given)
+        return self._loop_over_steps(event=event, **given)
+
+    def _loop_over_steps(
         self,
         *,
         args,
