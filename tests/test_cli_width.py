@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 from manifold_jax._tools import certify as _certify
 from manifold_jax._tools.certify.checks import Check, Combination
 from manifold_jax._tools.cli import app, commands
-from manifold_jax._tools.compare import methods, paper
+from manifold_jax._tools.compare import methods, paper, report
 
 
 WIDTHS = (40, 60, 80, 100, 120)
@@ -121,3 +121,18 @@ def test_files_get_whole_lines():
         "projected 1048576 262144 7340032 1.1e-16 2.2e-102 3.3e-05 12345 123.45".split()
     )
     assert "exact failed: no [hope] at 1.5e-12." in result.stdout
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        (1.234, "1.23"),
+        (12.34, "12.3"),
+        (123.4, "123"),
+        (12345.0, "12345"),
+        (None, "-"),
+        ("no", "no"),
+    ],
+)
+def test_three_digits_and_all_before_the_point(value, text):
+    assert report.format_number(value, ".3g") == text

@@ -31,6 +31,7 @@ EXACT = {
     "gradient": lambda x: jax.grad(lambda x: jnp.sum(x[:3] ** 2 * x[3:]))(x),
     "cumulated": jnp.cumsum,
     "columns first": lambda x: x.reshape(2, 3).ravel(order="F"),
+    "divided": lambda x: x[:3] / x[3:],
     "rolled": lambda x: jnp.roll(x, 1) / 2,
     "padded": lambda x: jnp.pad(x[:2], (1, 2)) - jnp.tile(x[2:3], 5),
     "crossed": lambda x: jnp.cross(x[:3], x[3:]),
