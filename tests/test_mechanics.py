@@ -641,3 +641,17 @@ def test_indefinite_mass_in_one_lane_leaves_the_others_alone():
     assert mixed_okay.tolist() == [True, False, True]
     for a, b in zip(jax.tree.leaves(good), jax.tree.leaves(mixed)):
         np.testing.assert_array_equal(a[::2], b[::2])
+
+
+def test_a_consistent_start_has_the_nearest_velocities():
+    """In the metric of the masses at the corrected positions: `M (v - v0)` is a force of the rods."""
+    system = mj.MechanicalSystem(mass_matrix, two_rods, weight)
+    q0, v0 = STATE[0] + 0.2, STATE[1] + jnp.array([[0.3, 0.1], [-0.2, 0.4]])
+    (q, v), info = mj.consistent_state(system.constraint, 0.0, (q0, v0))
+    assert info.correction > 0.05
+    assert np.abs(jax.flatten_util.ravel_pytree(two_rods(0.0, q, None))[0]).max() < 1e-14
+    J = jax.jacobian(lambda x: jnp.stack(list(two_rods(0.0, x.reshape(2, 2), None).values())))
+    J, change = J(q.ravel()), mass_matrix(q, None) @ (v - v0).ravel()
+    np.testing.assert_allclose(J @ v.ravel(), 0, atol=1e-14)
+    multipliers = np.linalg.lstsq(J.T, change)[0]
+    np.testing.assert_allclose(J.T @ multipliers, change, rtol=0, atol=1e-13)
