@@ -148,7 +148,9 @@ def check_violations(
     values = _violations_at(structure, lanes, found, which, k)
     between = judge.between * (structure.output not in ("t1", "steps"))
     strict = structure.is_corrected or structure.approach == "steps-only"
-    limit = np.full(which.shape, ROUND_OFF) if strict else judge.bound[which] + between
+    # A row of `n` numbers adds up as many errors, and is measured by its largest one.
+    loose = structure.family.n * (judge.bound[which] + between)
+    limit = np.full(which.shape, ROUND_OFF) if strict else loose
     faults = []
     wrong = np.flatnonzero((values > limit) & (judge.trusted[which] | strict))
     if wrong.size > 0:
