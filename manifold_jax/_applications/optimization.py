@@ -184,7 +184,7 @@ def _start_faults(lagrangian: Lagrangian, start: Float[Array, " n"]) -> Bool[Arr
         [
             ~(jnp.isfinite(level) & jnp.all(jnp.isfinite(G))),
             ~(jnp.isfinite(value) & jnp.all(jnp.isfinite(slope))),
-            ~factorization.full_rank,
+            ~factorization.usable,
             level > NewtonProjection().tolerance_for(start.dtype),
         ]
     )

@@ -63,4 +63,4 @@ def _violation(constraint: AbstractConstraint, t: Array, y: Y, args: Args) -> Fl
     equations = equations_of(
         constraint, t, y, args, NewtonProjection(), constraint.redundant, structure=structure
     )
-    return equations.level(equations.normals())
+    return equations.scaled_residual(equations.normals())

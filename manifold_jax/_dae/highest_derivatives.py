@@ -51,6 +51,6 @@ class HighestDerivatives(AbstractEquations):
         fixed = without_derivative(self)
         matrix = fixed.linearize(self.z)
         w = -matrix.solve(fixed.residual(None))
-        w = implicit_root(self, jnp.where(matrix.full_rank, w, 0))
+        w = implicit_root(self, jnp.where(matrix.usable, w, 0))
         # Added, not selected: the derivative of a discarded NaN would be NaN.
-        return w + jnp.where(matrix.full_rank, 0, jnp.nan).astype(w.dtype)
+        return w + jnp.where(matrix.usable, 0, jnp.nan).astype(w.dtype)

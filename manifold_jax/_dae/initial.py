@@ -139,14 +139,14 @@ def _found(
     if implicit:
         w, solvable = _leading(system.closing(t, z, args), w)
     closing, fixed_w = without_derivative((system.closing(t, z, args), w))
-    regular = closing.linearize(fixed_w).full_rank
+    regular = closing.linearize(fixed_w).usable
     t, args, c = closing.t, closing.args, system.analysis.c
     residual = lambda z: system.hidden_constraints(t, z, args, 0, c, fixed_w)
     r, G = jacobian(residual, closing.z)
     level, full_rank = jnp.zeros((), guess.dtype), jnp.asarray(True)
     if r.size > 0:  # or there may be no state at all
         level = jnp.max(jnp.abs(r) / row_scale(G, closing.z))
-        full_rank = factorize_equilibrated(gram(G, G * free[None, :])).full_rank
+        full_rank = factorize_equilibrated(gram(G, G * free[None, :])).usable
     near = level <= NewtonProjection().tolerance_for(z.dtype)
     success = finite & near & nearest.settled & full_rank & regular & solvable
     correction = jnp.max(jnp.abs(closing.z - guess) / (jnp.abs(guess) + 1), initial=0)

@@ -91,9 +91,9 @@ class Eliminated(NamedTuple):
         return Eliminated(plan, pivots, right, below, rest)
 
     @property
-    def full_rank(self) -> BoolScalar:
-        regular = jnp.all(self.pivots != 0)
-        return regular if self.rest is None else regular & self.rest.full_rank
+    def usable(self) -> BoolScalar:
+        nonzero = jnp.all(self.pivots != 0)
+        return nonzero if self.rest is None else nonzero & self.rest.usable
 
     def solve(self, b: Float[Array, " n"]) -> Float[Array, " n"]:
         plan = self.plan

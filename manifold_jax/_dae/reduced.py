@@ -123,4 +123,4 @@ class ReducedConstraint(AbstractConstraint):
     def faults(self, t, y, args=None) -> tuple[tuple[BoolScalar, str], ...]:
         z, w = self.system.split(jfu.ravel_pytree(y)[0])
         closing = self.system.closing(t, z, args)
-        return ((~closing.linearize(z if w is None else w).full_rank, _SINGULAR),)
+        return ((~closing.linearize(z if w is None else w).usable, _SINGULAR),)

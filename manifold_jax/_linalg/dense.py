@@ -24,9 +24,9 @@ UNROLL_LIMIT = 8
 
 
 class Factorization(eqx.Module):
-    """A square matrix, the factors with which its systems are solved, and whether its rank was full.
+    """A square matrix, the factors with which its systems are solved, and whether they are usable.
 
-    Where it was not the solution is finite but meaningless: its derivative must not be NaN, as
+    Where they are not, the solution is finite but meaningless: its derivative must not be NaN, as
     the zero cotangent of a rejected step would turn into NaN, too.
 
     The derivative is that of `A x = b`, not of the elimination: five times less to compile.
@@ -34,7 +34,7 @@ class Factorization(eqx.Module):
 
     A: Float[Array, "m m"]
     factors: Any  # with `solve` and `solve_transposed`, held fixed
-    full_rank: BoolScalar
+    usable: BoolScalar  # full rank
     product: Callable = eqx.field(static=True)  # of `A` and what it is solved for
 
     def solve(self, b: Float[Array, "m ..."]) -> Float[Array, "m ..."]:
@@ -92,7 +92,7 @@ class Inverse(eqx.Module):
     """The inverse of a matrix, or its pseudo-inverse."""
 
     inverse: Float[Array, "m m"]
-    full_rank: BoolScalar
+    usable: BoolScalar  # full rank; of a pseudo-inverse, which does not need it, finite
     product: Callable = eqx.field(static=True)
 
     def solve(self, b: Float[Array, "m ..."]) -> Float[Array, "m ..."]:
@@ -117,7 +117,7 @@ def factorize_once(A: Float[Array, "m m"]) -> "Factorization | Inverse":
 
 @jax.custom_jvp
 def _invert(A: Float[Array, "m m"]) -> tuple[Float[Array, "m m"], BoolScalar]:
-    """And whether the rank was full, as in [`factorize`][]."""
+    """Return the inverse, and whether the rank was full, as in [`factorize`][]."""
     m = A.shape[0]
     rows, diagonal = jnp.arange(m), jnp.abs(jnp.diagonal(A))
     full_rank = jnp.asarray(True)
@@ -179,15 +179,15 @@ def factorize(A: Float[Array, "m m"]) -> Factorization:
 
 # Equations that depend on each other on the manifold do so only nearly at a stage off it:
 # eigenvalues of `A` below this fraction of the largest count as zero.
-_DEPENDENT = 1e-4
+DEPENDENCE_THRESHOLD = 1e-4
 
 
-def pseudo_invert(A: Float[Array, "m m"], dependent: Any = _DEPENDENT) -> Inverse:
+def pseudo_invert(A: Float[Array, "m m"], dependent: Any = DEPENDENCE_THRESHOLD) -> Inverse:
     """Return `A^+` of a symmetric positive semidefinite matrix with its diagonal scaled to one, so
     that the units of equations do not decide which of them depend on others: for such equations the
     solution of least norm, each unknown multiplied by the square root of its diagonal entry.
-    Eigenvalues below `dependent` times the largest count as zero. In the place of a full rank, which
-    is not asked for, it says whether the matrix was finite."""
+    Eigenvalues below `dependent` times the largest count as zero. Usable if the matrix is finite,
+    whatever its rank."""
     finite = jnp.all(jnp.isfinite(A))
     A = jnp.where(finite, A, jnp.eye(A.shape[0], dtype=A.dtype))
     diagonal = jax.lax.stop_gradient(jnp.diagonal(A))

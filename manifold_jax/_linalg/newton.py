@@ -65,7 +65,7 @@ class Iterate(NamedTuple):
 
     z: Float[Array, " m"]
     r: Float[Array, " m"]
-    level: FloatScalar  # max_i |r_i| / scale_i
+    scaled_residual: FloatScalar  # max_i |r_i| / scale_i
     iterations: IntScalar
     progress: BoolScalar  # whether the last iteration lowered the residual
 
@@ -78,18 +78,18 @@ class _Search(NamedTuple):
 
     def at(self, z: Float[Array, " m"]) -> tuple[Float[Array, " m"], FloatScalar]:
         r = self.equations.residual(self.equations.point(z))
-        return r, self.level(r)
+        return r, self.scaled(r)
 
-    def level(self, r: Float[Array, " m"]) -> FloatScalar:
+    def scaled(self, r: Float[Array, " m"]) -> FloatScalar:
         return jnp.max(jnp.abs(r) / self.scale)
 
     def lowered(self, state: Iterate, dz: Float[Array, " m"]) -> Iterate:
         """The step `z - dz` if it lowers the residual, else the state as it was."""
         z = state.z - dz
-        r, level = self.at(z)
-        progress = level < state.level
+        r, scaled_residual = self.at(z)
+        progress = scaled_residual < state.scaled_residual
         best = jtu.tree_map(
-            lambda new, old: jnp.where(progress, new, old), (z, r, level), state[:3]
+            lambda new, old: jnp.where(progress, new, old), (z, r, scaled_residual), state[:3]
         )
         return Iterate(*best, state.iterations + 1, progress)  # pyright: ignore[reportCallIssue]
 
@@ -121,15 +121,15 @@ def chord(
     search = _Search(equations, scale)
     written_out = min(2, max_steps) if r.size <= _WRITTEN_OUT else 0
     rounding = _ROUNDING * jnp.finfo(r.dtype).eps
-    level = search.level(r)
-    needed = level > rounding
+    scaled_residual = search.scaled(r)
+    needed = scaled_residual > rounding
     for _ in range(written_out):
         z = jnp.where(needed, z - linearization.solve(r), z)
-        r, level = search.at(z)
+        r, scaled_residual = search.at(z)
     return jax.lax.while_loop(
-        lambda s: (s.level > rounding) & s.progress & (s.iterations < max_steps),
+        lambda s: (s.scaled_residual > rounding) & s.progress & (s.iterations < max_steps),
         lambda s: search.lowered(s, linearization.solve(s.r)),
-        Iterate(z, r, level, jnp.asarray(written_out, jnp.int32), jnp.asarray(True)),
+        Iterate(z, r, scaled_residual, jnp.asarray(written_out, jnp.int32), jnp.asarray(True)),
     )
 
 
@@ -147,8 +147,8 @@ def damped_newton(
 
     def unfinished(carry: tuple[Iterate, FloatScalar]) -> BoolScalar:
         s, _ = carry
-        stalled = ~s.progress & (s.level <= tolerance)
-        rounded = s.level <= _ROUNDING * jnp.finfo(r.dtype).eps
+        stalled = ~s.progress & (s.scaled_residual <= tolerance)
+        rounded = s.scaled_residual <= _ROUNDING * jnp.finfo(r.dtype).eps
         return ~rounded & ~stalled & (s.iterations < max_steps)
 
     def advance(carry: tuple[Iterate, FloatScalar]) -> tuple[Iterate, FloatScalar]:
@@ -157,8 +157,8 @@ def damped_newton(
         s = search.lowered(s, damping * dz)
         return s, jnp.where(s.progress, jnp.ones_like(damping), damping / 4)
 
-    start = Iterate(z, r, search.level(r), jnp.zeros((), jnp.int32), jnp.asarray(True))
-    return jax.lax.while_loop(unfinished, advance, (start, jnp.ones_like(start.level)))[0]
+    start = Iterate(z, r, search.scaled(r), jnp.zeros((), jnp.int32), jnp.asarray(True))
+    return jax.lax.while_loop(unfinished, advance, (start, jnp.ones_like(start.scaled_residual)))[0]
 
 
 def find_root(

@@ -38,8 +38,8 @@ class AbstractRows(eqx.Module):
 
     @abc.abstractmethod
     def factorize(self, directions: "AbstractRows", checked: bool = True) -> Any:
-        """`C V` with the rows of `V^T`, factored: `solve(b)`, and `full_rank`. That is not known if
-        it is not checked; then look at the residuals of solutions, `solves(residual, size2)`."""
+        """`C V` with the rows of `V^T`, factored: `solve(b)`, and whether that is `usable`. Unless it
+        is `checked`, test residuals of solutions instead with `solves(residual, size2)`."""
 
     @abc.abstractmethod
     def of_other(self, function: Any, t: Array, x: Float[Array, " n"], args: Any) -> "AbstractRows":

@@ -20,8 +20,8 @@ class ExtendedConstraint(AbstractConstraint):
     """The constraints of a [`MechanicalSystem`][] on its state `(q, v, z)`: those of the motion
     `(q, v)`, and of the auxiliary states `z` alone, if they have any.
 
-    Built by `MechanicalSystem.constraint`. Both are corrected by themselves. ConstraintNormals are
-    those of the motion: in local coordinates `z` is corrected along its own.
+    Built by `MechanicalSystem.constraint`. Both are corrected by themselves. The normals are those
+    of the motion: in local coordinates `z` is corrected along its own.
     """
 
     motion: MechanicalConstraint

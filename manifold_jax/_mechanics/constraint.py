@@ -34,7 +34,7 @@ class MechanicalConstraint(AbstractConstraint):
 
     Built by `MechanicalSystem.constraint`. Corrections use its structure: first the positions,
     then the velocities, which is a linear problem, with the same matrix. The derivative of
-    `J v` is never formed. ConstraintNormals are those of the velocities.
+    `J v` is never formed. The normals are those of the velocities.
     """
 
     holonomic: Callable | None

@@ -93,8 +93,8 @@ class TwoStages(NamedTuple):
     def _factored(self, x: Float[Array, " k"], w: Float[Array, " k"]) -> tuple[FactoredGram, int]:
         normals, p, valid = self.normals(x, w)
         factored = FactoredGram.of(normals, self.here.system.redundant)
-        full_rank = factored.factorization.full_rank & valid
-        factorization = dataclasses.replace(factored.factorization, full_rank=full_rank)
+        usable = factored.factorization.usable & valid
+        factorization = dataclasses.replace(factored.factorization, usable=usable)
         return FactoredGram(normals, factorization), p
 
     def _positions(self, x, safe, factored: FactoredGram, p: int, far: bool) -> CorrectionRoot:

@@ -59,7 +59,7 @@ class Mass(eqx.Module):
         """`M^-1` applied to each row."""
         if self.factorization is None:
             return rows / jnp.broadcast_to(self.diagonal, rows.shape)  # pyright: ignore[reportArgumentType]
-        if self.factorization.full_rank.ndim == 0:
+        if self.factorization.usable.ndim == 0:
             return self.factorization.solve(rows.T).T
         number, size = self.factorization.A.shape[:2]
         parts = jnp.moveaxis(rows.reshape(*rows.shape[:-1], number, size), -2, 0)
@@ -135,7 +135,7 @@ def factorize_mass(M: Float[Array, "..."] | InvertedBlocks, C: Rows) -> Mass | I
         return _factorize_blocks(M, C)
     symmetric, weights = _is_symmetric(M), jax.lax.stop_gradient(_weights(M, C))
     factorization = factorize_positive(M + gram((C * weights[:, None]).T, C.T))
-    return Mass(None, factorization, weights, symmetric, factorization.full_rank)
+    return Mass(None, factorization, weights, symmetric, factorization.usable)
 
 
 def _is_symmetric(M: Float[Array, "*b n n"]) -> BoolScalar:
@@ -156,7 +156,7 @@ def _factorize_blocks(M: Float[Array, "b d d"], C: Rows) -> Mass | InvertedBlock
     if C.structure.local.any():
         M, augmentation = _augmented(M, C)
     factorization = jax.vmap(factorize_positive)(M)
-    return Mass(None, factorization, augmentation, symmetric, jnp.all(factorization.full_rank))
+    return Mass(None, factorization, augmentation, symmetric, jnp.all(factorization.usable))
 
 
 def _augmented(

@@ -77,14 +77,14 @@ class Motion:
             M = self.here.mass_values()
             factored = Factored(self.C, self.directions, self.mass, self.factorization)
             pair = solve_held_fixed(M, factored, force, -bias)
-            return _defined(*pair, self.mass.valid & self.factorization.full_rank)
+            return _defined(*pair, self.mass.valid & self.factorization.usable)
         if self.mass.augmentation is not None:
             force = force - combine(self.mass.augmentation * bias, self.C)
         free = self.mass.solve(force)
         right = multiply(self.C, free) + bias
         multipliers = self.factorization.solve(right)
         accelerations = free - combine(multipliers, self.directions)
-        valid = self.mass.valid & self.factorization.full_rank
+        valid = self.mass.valid & self.factorization.usable
         if isinstance(self.C, AbstractRows):
             # `M` applied to the free accelerations and to those by the constraints.
             size2 = jnp.abs(jnp.dot(free, force)) + jnp.abs(jnp.dot(multipliers, right))

@@ -25,7 +25,7 @@ from .checks import check_shape, is_concrete, on_host, stack
 from .rotations import quaternion_rate
 
 
-# Joints count as closed below this gap (m, or the cosine of an angle), or this many units of rounding.
+# Joints count as closed below this gap (m, or the sine of an angle), or this many units of rounding.
 CLOSED, ROUNDING = 1e-6, 50
 ITERATIONS = 50
 # Singular values below this fraction of the largest belong to equations that depend on others; at
@@ -146,14 +146,15 @@ class Closing:
         what = "The velocities do not agree with the joints"
         advice = "Give only those that are known, such that joints allow them, and `assemble=True`."
         most = _closed(x) * max(1, np.abs(w).max())
-        self._refuse_gaps(np.abs(driven + J @ w), most, "m/s", what, advice)
+        self._refuse_gaps(np.abs(driven + J @ w), most, "in m/s or rad/s", what, advice)
         if not self.assembly.redundant:
             self._check_rank(J)
 
     def _check_positions(self, x: np.ndarray, advice: str) -> None:
         phi, _, _ = self.known(x)
         what = "The state does not satisfy the joints"
-        self._refuse_gaps(np.abs(phi), _closed(x), "m", what, advice)
+        unit = "in m or the sine of an angle"
+        self._refuse_gaps(np.abs(phi), _closed(x), unit, what, advice)
 
     def _refuse_gaps(
         self, gaps: np.ndarray, most: float, unit: str, what: str, advice: str
@@ -164,8 +165,8 @@ class Closing:
         sizes = [(name, gaps[rows].max()) for name, rows in self.named_rows]
         order = np.argsort([size for _, size in sizes])[::-1][:5]
         largest = [sizes[i] for i in order if not sizes[i][1] <= most]
-        worst = ", ".join(f"{name} (gap {size:.3g} {unit})" for name, size in largest)
-        raise ValueError(f"{what}: {worst}. {advice}")
+        worst = ", ".join(f"{name} (gap {size:.3g})" for name, size in largest)
+        raise ValueError(f"{what}: {worst}, {unit}. {advice}")
 
     def _check_rank(self, J: np.ndarray) -> None:
         J = J / np.maximum(np.linalg.norm(J, axis=1, keepdims=True), np.finfo(J.dtype).tiny)

@@ -69,7 +69,7 @@ def rosenbrock_step(
         tuple(_plus(None, weights, U) for weights in tableau.dense),
         after,
         finite[0] & finite[1] & finite[2],
-        factor.full_rank,
+        factor.usable,
     )
 
 

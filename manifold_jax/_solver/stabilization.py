@@ -139,7 +139,7 @@ class InvariantStabilization(AbstractStabilization):
         if self.projected:
             residual = lambda t, x: equations.function(t, x, equations.args)
             rate = rate + jax.jvp(residual, (t, x), (jnp.ones_like(t), w))[1]
-        undefined = jnp.where(factored.factorization.full_rank, 0, jnp.nan).astype(w.dtype)
+        undefined = jnp.where(factored.factorization.usable, 0, jnp.nan).astype(w.dtype)
         return unravel(w - combine(factored.solve(rate), factored.normals.directions) + undefined)
 
 

@@ -34,6 +34,9 @@ from ..lanes.trajectory import Equations
 from .devices import check_mesh, over_devices
 
 
+DEFAULT_LANES = 128
+
+
 @refuse_old_names(in_axes="args_axes")
 @clear_errors
 @checking_first_step
@@ -52,7 +55,7 @@ def solve_ensemble(
     stepsize_controller: dfx.AbstractStepSizeController = dfx.ConstantStepSize(),
     max_steps: int = 4096,
     args_axes: Any = None,
-    lanes: int = 128,
+    lanes: int = DEFAULT_LANES,
     adjoint: dfx.AbstractAdjoint = StepReplayAdjoint(),
     mesh: Mesh | None = None,
     throw: bool = False,

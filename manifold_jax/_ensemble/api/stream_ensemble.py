@@ -33,7 +33,7 @@ from ..stored.store import stored_at, StoredEnsemble
 from .progress import Meter
 from .sampling import drawn
 from .settings import check_settings, settings_of
-from .solve_ensemble import solve_ensemble
+from .solve_ensemble import DEFAULT_LANES, solve_ensemble
 
 
 # Numbers of trajectories are 32-bit integers where JAX has no others.
@@ -55,7 +55,7 @@ def stream_ensemble(
     saveat: dfx.SaveAt = dfx.SaveAt(t1=True),
     stepsize_controller: dfx.AbstractStepSizeController = dfx.ConstantStepSize(),
     max_steps: int = 4096,
-    lanes: int = 128,
+    lanes: int = DEFAULT_LANES,
     consistent: Consistent = "project",
     chunk: int = 8192,
     seed: int = 0,

@@ -28,7 +28,7 @@ class BlockFactorization(eqx.Module):
     eliminated: Any
     structure: Structure = eqx.field(static=True)
     symmetric: bool = eqx.field(static=True)
-    full_rank: BoolScalar
+    usable: BoolScalar
 
     @staticmethod
     def of(
@@ -42,7 +42,7 @@ class BlockFactorization(eqx.Module):
         )
         if not checked:
             return factorization
-        return dataclasses.replace(factorization, full_rank=factorization._is_right(product))
+        return dataclasses.replace(factorization, usable=factorization._is_right(product))
 
     def solve(self, b: Float[Array, " m"]) -> Float[Array, " m"]:
         solve = lambda multiply, b: self._refined(self.eliminated, multiply, b)
