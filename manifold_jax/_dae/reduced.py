@@ -33,7 +33,7 @@ class Reduced(eqx.Module):
     equations: Equations
     analysis: Analysis = eqx.field(static=True)
 
-    def closing(self, t: Any, z: Array, args: Args) -> HighestDerivatives:
+    def leading_equations(self, t: Any, z: Array, args: Args) -> HighestDerivatives:
         return HighestDerivatives(self.equations, as_time(t, z.dtype), z, args, self.analysis)
 
     def split(self, y: Y) -> tuple[Array, Array | None]:
@@ -52,7 +52,7 @@ class Reduced(eqx.Module):
     def field(self, t: RealScalarLike, y: Float[Array, " states"], args: Args) -> Array:
         """The vector field on the state.
 
-        In the form of index 1 the leading derivatives are unknowns `w` of their own behind the state,
+        In the form of index 1 the leading derivatives are unknowns `w` of their own after the state,
 
             z' = (z, w),   0 = F_i^(c_i)(t, z, w),
 
@@ -60,10 +60,10 @@ class Reduced(eqx.Module):
         vector field: a Rosenbrock method does both at once.
         """
         z, w = self.split(y)
-        closing, rate = self.closing(t, z, args), self.analysis.layout.rate()
+        leading, rate = self.leading_equations(t, z, args), self.analysis.layout.rate()
         if w is None:
-            return rate(z, closing.solve())
-        return jnp.concatenate([rate(z, w), closing.residual(w)])
+            return rate(z, leading.solve())
+        return jnp.concatenate([rate(z, w), leading.residual(w)])
 
     def hidden_constraints(
         self,
@@ -90,11 +90,11 @@ class Reduced(eqx.Module):
         """`x, x', ...` up to that derivative, by differentiating along the solution."""
         layout = self.analysis.layout
         z, w = self.split(y)
-        w = self.closing(t, z, args).solve() if w is None else w
+        w = self.leading_equations(t, z, args).solve() if w is None else w
 
         def leading(t: Array, z: Array) -> Array:
             """Solved for only once: nearby, the same as the function that the equations define."""
-            return implicit_root(self.closing(t, z, args), w)
+            return implicit_root(self.leading_equations(t, z, args), w)
 
         def differentiated(function: Callable) -> Callable:
             along = lambda t, z: (jnp.ones_like(t), layout.rate()(z, leading(t, z)))
@@ -122,5 +122,5 @@ class ReducedConstraint(AbstractConstraint):
 
     def faults(self, t, y, args=None) -> tuple[tuple[BoolScalar, str], ...]:
         z, w = self.system.split(jfu.ravel_pytree(y)[0])
-        closing = self.system.closing(t, z, args)
-        return ((~closing.linearize(z if w is None else w).usable, _SINGULAR),)
+        matrix = self.system.leading_equations(t, z, args).linearize(z if w is None else w)
+        return ((~matrix.usable, _SINGULAR),)

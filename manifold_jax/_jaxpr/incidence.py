@@ -1,9 +1,8 @@
-"""Which numbers that a function returns depend on which of the numbers it is given.
+"""Sparsity pattern of the Jacobian of a traced function, without computing derivatives.
 
-The traced function is walked through once with sets of inputs in the place of numbers. What depends
-on a number is never missed: a primitive without a rule makes all it returns depend on all it gets.
-Also what is piecewise constant counts, as comparisons and `sign`: their value matters even where
-their derivative is zero.
+The traced function is evaluated once with sets of inputs in the place of numbers. No dependence is
+missed: all results of a primitive without a rule depend on all of its operands. Piecewise constant
+functions such as comparisons and `sign` count as dependent, although their derivative is zero.
 """
 
 import functools
@@ -16,31 +15,30 @@ import jax.core
 import numpy as np
 
 from .._base.compat import scan_counts
-from .incidence_rules import known_value, RULES, union, Value
+from .incidence_rules import flagged, known_value, RULES, union, Value
 from .trace import called, unrolled_scan, walk
 
 
-# Iterations of a scan that are walked through one by one, so that counters are known.
+# Largest number of iterations of a scan that are evaluated one by one, so that counters are known.
 _MOST_ITERATIONS = 1000
 
 
 class Incidence(NamedTuple):
-    """`depends[i, j]`: the number `i` that is returned depends on the input `j`. And the primitives
-    without a rule of their own, with how often they were met."""
+    """The dependence of the results of a function on its inputs."""
 
-    depends: np.ndarray
-    unknown_primitives: dict[str, int]
+    depends: np.ndarray  # [i, j]: the number `i` that is returned depends on the input `j`
+    unknown_primitives: dict[str, int]  # without a rule, with how often they were met
 
 
 def incidence(function: Callable, *tracked: tuple[Any, np.ndarray]) -> Incidence:
-    """Return the incidence of `function(*arguments)`, which returns one vector. For each argument,
-    a pytree of arrays, the inputs as which its numbers count: a bool array of shape `(numbers,
-    inputs)`."""
+    """Return the incidence of `function(*arguments)`, which returns one vector. `tracked` are pairs of
+    an argument, a pytree of arrays, and of the inputs as which its numbers count: a bool array of
+    shape `(numbers, inputs)`."""
     arguments = [argument for argument, _ in tracked]
     closed = jax.make_jaxpr(function)(*arguments)
     inputs = np.concatenate([inputs for _, inputs in tracked])
     values, number, start = [], inputs.shape[1], 0
-    # All may be other than zero.
+    # With the flag of [`Value`][]: all of them may be other than zero.
     inputs = np.append(inputs, np.ones((len(inputs), 1), bool), axis=1)
     for leaf in jax.tree_util.tree_leaves(arguments):
         end = start + np.size(leaf)
@@ -52,7 +50,7 @@ def incidence(function: Callable, *tracked: tuple[Any, np.ndarray]) -> Incidence
 
 
 class Search(NamedTuple):
-    """What depends on what, in the order of execution of a traced function."""
+    """Evaluates a traced function with a [`Value`][] for every array."""
 
     number: int  # of inputs
     unknown: Counter
@@ -66,9 +64,7 @@ class Search(NamedTuple):
                 return Value.constant(np.asarray(constant), self.number)
         except (TypeError, ValueError):  # random keys, for instance
             pass
-        depends = np.zeros((*np.shape(constant), self.number + 1), bool)
-        depends[..., -1] = True
-        return Value(depends)
+        return Value(flagged(np.zeros((*np.shape(constant), self.number + 1), bool), True))
 
     def _equation(self, equation: Any, values: list[Value]) -> list[Value]:
         name = equation.primitive.name
@@ -90,8 +86,9 @@ class Search(NamedTuple):
         )
 
     def _any(self, equation: Any, values: list[Value]) -> list[Value]:
-        """All that is returned depends on all that is given."""
-        everything = np.append(union(values)[:-1] if values else np.zeros(self.number, bool), True)
+        """Let all that is returned depend on all that is given."""
+        everything = union(values) if values else np.zeros(self.number + 1, bool)
+        everything = flagged(everything, True)
         self.unknown[equation.primitive.name] += int(everything[:-1].any())
         shapes = [(*out.aval.shape, self.number + 1) for out in equation.outvars]
         return [Value(np.broadcast_to(everything, shape)) for shape in shapes]

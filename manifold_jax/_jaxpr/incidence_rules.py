@@ -1,4 +1,4 @@
-"""What the results of one primitive depend on, number by number."""
+"""Dependence of the results of one primitive on its operands, number by number."""
 
 import functools
 import math
@@ -14,22 +14,32 @@ from .primitives import arranged_factors, ELEMENTWISE, evaluated, MOVES, sources
 
 
 class Value(NamedTuple):
-    """What is known of an array of shape `S`: the inputs its numbers depend on, shape `(*S, inputs
-    + 1)`, and the numbers themselves if they are constants. Behind the inputs stands whether a
-    number may be other than zero: for sums and moves that follows the same rule."""
+    """What is known of an array of shape `S`."""
 
-    depends: np.ndarray
-    known: np.ndarray | None = None
+    # On which inputs each number depends. The last column is a flag, whether the number may be other
+    # than zero: for sums and moves it follows the same rule.
+    depends: np.ndarray  # (*S, inputs + 1), bool
+    known: np.ndarray | None = None  # the numbers, if they are constants
 
     @staticmethod
     def constant(known: np.ndarray, inputs: int) -> "Value":
-        depends = np.zeros((*known.shape, inputs + 1), bool)
-        depends[..., -1] = known != 0
-        return Value(depends, known)
+        return Value(flagged(np.zeros((*known.shape, inputs + 1), bool), known != 0), known)
 
     @property
     def is_constant(self) -> bool:
         return not self.depends[..., :-1].any()
+
+
+def flagged(depends: np.ndarray, nonzero: Any) -> np.ndarray:
+    """Return `depends` with another flag "may be other than zero", `nonzero`."""
+    depends = depends.copy()
+    depends[..., -1] = nonzero
+    return depends
+
+
+def may_be_nonzero(depends: np.ndarray) -> np.ndarray:
+    """Return the flag, shape `(*S, 1)`."""
+    return depends[..., -1:]
 
 
 # Larger constants are not folded: their zeros are not worth the time.
@@ -37,7 +47,7 @@ _MOST_FOLDED = 1_000_000
 
 
 def known_value(equation: Any, values: list[Value]) -> list[np.ndarray] | None:
-    """What an equation makes of constants, if it is known."""
+    """Return the results of an equation of constants, `None` if they cannot be computed."""
     size = sum(math.prod(out.aval.shape) for out in equation.outvars)
     if size > _MOST_FOLDED or any(value.known is None for value in values):
         return None
@@ -48,7 +58,7 @@ def known_value(equation: Any, values: list[Value]) -> list[np.ndarray] | None:
 
 
 def union(values: list[Value]) -> np.ndarray:
-    """All inputs that any of the numbers depends on."""
+    """Return all inputs on which any of the numbers depends, with the flag, shape `(inputs + 1,)`."""
     flat = [value.depends.reshape(-1, value.depends.shape[-1]).any(axis=0) for value in values]
     return functools.reduce(np.logical_or, flat)  # pyright: ignore[reportReturnType]
 
@@ -58,7 +68,7 @@ def _spread(depends: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
 
 
 def _vanishing(equation: Any, values: list[Value]) -> list[Value]:
-    """Number by number, and zero of zeros."""
+    """Elementwise functions whose value at zeros is zero."""
     shape = equation.outvars[0].aval.shape
     return [
         Value(functools.reduce(np.logical_or, [_spread(value.depends, shape) for value in values]))
@@ -66,20 +76,18 @@ def _vanishing(equation: Any, values: list[Value]) -> list[Value]:
 
 
 def _elementwise(equation: Any, values: list[Value]) -> list[Value]:
-    depends = _vanishing(equation, values)[0].depends.copy()
-    depends[..., -1] = True
-    return [Value(depends)]
+    return [Value(flagged(_vanishing(equation, values)[0].depends, True))]
 
 
 def _multiply(equation: Any, values: list[Value]) -> list[Value]:
-    """Nothing depends on what is multiplied by zero."""
+    """A product with a zero is zero, and depends on nothing."""
     a, b = (_spread(value.depends, equation.outvars[0].aval.shape) for value in values)
-    return [Value((a | b) & a[..., -1:] & b[..., -1:])]
+    return [Value((a | b) & may_be_nonzero(a) & may_be_nonzero(b))]
 
 
 def _divide(equation: Any, values: list[Value]) -> list[Value]:
     a, b = (_spread(value.depends, equation.outvars[0].aval.shape) for value in values)
-    return [Value((a | b) & a[..., -1:])]
+    return [Value((a | b) & may_be_nonzero(a))]
 
 
 def _power(equation: Any, values: list[Value]) -> list[Value]:
@@ -94,13 +102,8 @@ def _select(equation: Any, values: list[Value]) -> list[Value]:
     if which.known is not None:
         chosen = np.broadcast_to(which.known, shape).astype(int)[..., None]
         return [Value(np.choose(chosen, alternatives))]
-    depends = functools.reduce(np.logical_or, alternatives)
-    return [
-        Value(
-            depends
-            | _spread(which.depends, shape) & (np.arange(depends.shape[-1]) + 1 < depends.shape[-1])
-        )
-    ]
+    chosen_by = _spread(flagged(which.depends, False), shape)
+    return [Value(functools.reduce(np.logical_or, alternatives) | chosen_by)]
 
 
 def _moved(equation: Any, values: list[Value]) -> list[Value] | None:
@@ -109,8 +112,8 @@ def _moved(equation: Any, values: list[Value]) -> list[Value] | None:
         return None
     which, places = found
     rows = [values[i].depends.reshape(-1, values[i].depends.shape[-1]) for i in which]
-    nowhere = np.arange(rows[0].shape[1]) == rows[0].shape[1] - 1  # some constant
-    table = np.concatenate([*rows, nowhere[None]])
+    constant = flagged(np.zeros((1, rows[0].shape[1]), bool), True)
+    table = np.concatenate([*rows, constant])
     return [Value(table[place]) for place in places]
 
 
@@ -126,7 +129,7 @@ def _cumulated(equation: Any, values: list[Value]) -> list[Value]:
 
 
 def _contracted(equation: Any, values: list[Value]) -> list[Value]:
-    """A product of arrays, in which some numbers may be zero."""
+    """A sum of products, of which those with a zero do not count."""
     arrays = [value.depends.astype(np.float32) for value in values]
     a, b = arranged_factors(equation, arrays)
     depends = np.einsum("bisn,bjs->bijn", a, b[..., -1]) + np.einsum(
@@ -136,8 +139,8 @@ def _contracted(equation: Any, values: list[Value]) -> list[Value]:
 
 
 def _landing(equation: Any, operand: tuple, indices: np.ndarray, update: tuple) -> np.ndarray:
-    """Where each number of the update of a scatter goes: its index in the flat operand, -1 if it is
-    dropped. Shapes of operand and update."""
+    """Return where each number of the update of a scatter goes: its index in the flat operand, -1 if
+    it is dropped. `operand` and `update` are shapes."""
     keep = ("indices_are_sorted", "unique_indices", "mode")
     settings = {name: equation.params[name] for name in keep}
 
