@@ -1,4 +1,4 @@
-"""The reverse sweep: the recorded steps in reverse order, each computed once more and transposed."""
+"""The reverse sweep: the recorded steps in reverse order, each computed again and transposed."""
 
 from typing import Any, NamedTuple
 
@@ -63,13 +63,13 @@ class ReverseSweep(eqx.Module):
         return TimesBar(zero, zero, [jnp.zeros(n, zero.dtype) if n else None for n in counts])
 
     def _steps_of_segment(self, i: IntScalar) -> Step:
-        """Leading axes: blocks, steps."""
+        """Return the steps of a segment, with leading axes for blocks and steps."""
         record, sizes = self.record, self.record.sizes
         part = lambda x, i: lax.dynamic_slice_in_dim(x, i * sizes.segment, sizes.segment)
         times = part(record.times, i)
         accepted = times[..., 1] > -jnp.inf
-        # Rows of no accepted step hold one of no length from the first state: functions may refuse
-        # what is not a state or time.
+        # Rows that are not of an accepted step hold a step of length zero from the first state:
+        # functions may refuse anything that is not a state or a time.
         start, end = (jnp.where(accepted, times[..., i], self.ends.t0) for i in range(2))
         jumped = accepted & (times[..., 2] > 0) if record.jumps else None
         times = start, end, jumped, accepted
@@ -87,7 +87,7 @@ class ReverseSweep(eqx.Module):
         return Step(*times, {k: used(x, first[k]) for k, x in states.items()})
 
     def _states_again(self, i: IntScalar, steps: Step) -> Vectors:
-        """The states of a segment, computed from its first one."""
+        """Compute the states of a segment again from its first one."""
         record, packing = self.record, self.record.packing
 
         def advance(x, step):

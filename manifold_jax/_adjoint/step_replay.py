@@ -137,7 +137,7 @@ class StepReplayAdjoint(dfx.AbstractAdjoint):
                 return run(_while_loop), None
             return recording(record, solve.state, run)
 
-        # What the functions close over becomes their leaves, which have derivatives.
+        # Closed-over arrays of the functions become leaves, which have derivatives.
         forward = convert_closure(forward, record)
         differentiable = replay, start, times, forward
         (final_state, statistics), outputs, _ = _solve(differentiable, record, solve.remembers)

@@ -1,7 +1,7 @@
 """Correction of one point onto the manifold of any residual (the paper's perturbation approach).
 
-The corrected point is `p = x + V z` with directions `V` (shape `(n, m)`, held as the rows of `V^T`)
-that are fixed at the point `x` that is corrected, and `z` the root of `g(t, x + V z, args) = 0`.
+The corrected point is `p = x + V z` with directions `V` (shape `(n, m)`, held as the rows of `V^T`),
+fixed at the point `x` that is corrected, and the root `z` of `g(t, x + V z, args) = 0`.
 """
 
 import dataclasses
@@ -25,9 +25,9 @@ from .settings import NewtonProjection
 
 
 class ConstraintNormals(NamedTuple):
-    """What leads across the manifold at a point: the Jacobian `G`, and the directions, the rows of
-    `V^T`, along which points nearby are corrected, by default `V = W^-1 G^T`. Both `(m, k)` for
-    `k` components that are moved together, by default the `n` of the state."""
+    """The normals of a manifold at a point: the Jacobian `G`, and the directions, the rows of `V^T`,
+    along which points nearby are corrected, by default `V = W^-1 G^T`. Both `(m, k)` for `k` components
+    that are moved together, by default the `n` of the state."""
 
     jacobian: Rows
     directions: Rows
@@ -37,7 +37,7 @@ class FactoredGram(NamedTuple):
     """The normals at a point with `G V` factored: the linearization of a correction."""
 
     normals: ConstraintNormals
-    factorization: Any  # Factorization | Inverse, or that of sparse rows
+    factorization: Any  # Factorization, Inverse or BlockFactorization
 
     @staticmethod
     def of(
@@ -45,7 +45,7 @@ class FactoredGram(NamedTuple):
         redundant: bool,
         dependent: FloatScalar | float = DEPENDENCE_THRESHOLD,
     ) -> "FactoredGram":
-        """`dependent` as in `pseudo_invert`, for `redundant` equations."""
+        """Factor `G V`; `dependent` as in `pseudo_invert`, for `redundant` equations."""
         if isinstance(normals.jacobian, AbstractRows):
             return FactoredGram(normals, normals.jacobian.factorize(normals.directions))
         A = gram(*normals)
@@ -90,7 +90,7 @@ class CorrectionEquations(AbstractEquations):
         return self.function(self.t, x, self.args)
 
     def point(self, z: Float[Array, " m"]) -> Float[Array, " n"]:
-        """`x + V z` without forming `V`, so that its derivative does not either."""
+        """Return `x + V z` without forming `V`, so that its derivative does not either."""
         if self.directions is not None:
             return self.x + combine(z, self.directions)
         _, pullback = jax.vjp(self.residual, self.x)
@@ -145,7 +145,7 @@ class CorrectionEquations(AbstractEquations):
 
 
 class CorrectionRoot(NamedTuple):
-    """The corrected point, its multipliers, and how it went."""
+    """The corrected point, its multipliers, and a report of the iteration."""
 
     p: Float[Array, " n"]
     z: Float[Array, " m"]
@@ -162,10 +162,10 @@ def solve_correction(
     far: bool,
     factored: FactoredGram | None = None,
 ) -> CorrectionRoot:
-    """The root that the settings in `projection` lead to.
+    """Find the root with the settings in `projection`.
 
-    The derivative of a failed correction is taken at `safe`. Corrections that share a
-    Jacobian and its factorization pass them on as `factored`.
+    The derivative of a failed correction is taken at `safe`. Corrections that share a Jacobian and its
+    factorization pass them on as `factored`.
     """
     if projection.max_steps == 1 and not far:
         return _correct_once(equations, safe, factored)
@@ -176,7 +176,7 @@ def solve_correction(
 def _correct_once(
     equations: CorrectionEquations, safe: Float[Array, " n"], factored: FactoredGram | None
 ) -> CorrectionRoot:
-    """One Newton step, `x - V (G V)^-1 g(x)`, successful if it lowers the residual.
+    """Make one Newton step, `x - V (G V)^-1 g(x)`, successful if it lowers the residual.
 
     Differentiated as it stands: it is a map of its own, not an approximation of the root.
     """
@@ -245,10 +245,10 @@ def equations_of(
     directions: Float[Array, "m n"] | None = None,
     structure: Structure | None = None,
 ) -> CorrectionEquations:
-    """Those of the residual `function(t, y, args)` of a whole state."""
+    """Return the equations for the residual `function(t, y, args)` of a whole state."""
     x, unravel = jfu.ravel_pytree(y)
     t = as_time(t, x.dtype)
-    # Parameters that the residual closes over become inputs, so that they are differentiated.
+    # Closed-over parameters of the residual become inputs, so that they are differentiated.
     residual = convert_closure(
         lambda t, x, args: residual_vector(function, t, unravel(x), args), t, x, args
     )
@@ -262,5 +262,5 @@ def without_normal_part(
     rate: Float[Array, " m"],
     redundant: bool = False,
 ) -> Float[Array, " k"]:
-    """`e - V (G V)^-1 rate`, tangent if `rate = G e`."""
+    """Return `e - V (G V)^-1 rate`, which is tangent if `rate = G e`."""
     return e - combine(FactoredGram.of(normals, redundant).solve(rate), normals.directions)

@@ -1,4 +1,4 @@
-"""How corrections are made: in which norm, how many iterations, and how accurately."""
+"""Settings of corrections: the norm, the number of iterations and the tolerance."""
 
 from typing import Any, Literal
 
@@ -86,17 +86,17 @@ class NewtonProjection(eqx.Module):
             raise ValueError(f"`max_steps` must be a positive integer, got {self.max_steps!r}.")
 
     def tolerance_for(self, dtype: Any) -> RealScalarLike:
-        """The largest scaled residual that counts as success."""
+        """Return the largest scaled residual that counts as success."""
         return 50 * float(jnp.finfo(dtype).eps) if self.tolerance is None else self.tolerance
 
     @property
     def is_euclidean(self) -> bool:
-        """Whether nearest means nearest in the plain norm, for constraints without masses."""
+        """Whether the nearest point is that in the plain norm, for constraints without masses."""
         return self.metric is None or (isinstance(self.metric, str) and self.metric == "identity")
 
     def inverse_metric(self, y: Y) -> Float[Array, " n"] | None:
-        """Diagonal of `W^-1`, in the order of `ravel_pytree(y)`; `None` for the identity, and for
-        the masses of a mechanical system unless `metric="identity"`."""
+        """Return the diagonal of `W^-1`, in the order of `ravel_pytree(y)`; `None` for the identity,
+        and for the masses of a mechanical system unless `metric="identity"`."""
         if self.metric is None or isinstance(self.metric, str):
             return self._error_weights(y) if self.metric == "error" else None
         if jtu.tree_structure(self.metric) != jtu.tree_structure(y):
@@ -116,9 +116,10 @@ class NewtonProjection(eqx.Module):
         return 1 / jfu.ravel_pytree(jtu.tree_map(spread, self.metric, y))[0]
 
     def inverse_metric_without_masses(self, y: Y) -> Float[Array, " n"] | None:
-        """The same where `None` is not the masses. In the identity a correction of rounding size of a
-        large component moves a small one by as much: Robertson's reaction to 1e11 with `atol=1e-14` has
-        then 6.0 digits instead of 7.2, and makes 857 steps instead of 655."""
+        """Return the diagonal of `W^-1` for constraints without masses, where `None` is the identity.
+        In the identity a correction of rounding size of a large component moves a small one by as much:
+        Robertson's reaction to 1e11 with `atol=1e-14` then has 6.0 digits instead of 7.2, and takes 857
+        steps instead of 655."""
         atol = self.atol if isinstance(self.rtol, int | float) else None
         if (
             self.metric is None
@@ -137,7 +138,7 @@ class NewtonProjection(eqx.Module):
         return (self.atol + self.rtol * jnp.abs(jfu.ravel_pytree(y)[0])) ** 2
 
 
-# Units of rounding.
+# In units of rounding.
 _SMALLEST = 100
 
 
@@ -146,5 +147,5 @@ def _rounding(y: Y) -> float:
 
 
 def _may_be_positive(number: Any) -> bool:
-    """Unknown while tracing."""
+    """Whether weights are positive; true while tracing, when they are unknown."""
     return isinstance(number, jax.core.Tracer) or bool(np.all(np.asarray(number) > 0))

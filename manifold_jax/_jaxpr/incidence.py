@@ -62,7 +62,7 @@ class Search(NamedTuple):
         try:
             if not isinstance(constant, jax.core.Tracer):
                 return Value.constant(np.asarray(constant), self.number)
-        except (TypeError, ValueError):  # random keys, for instance
+        except (TypeError, ValueError):  # e.g. random keys
             pass
         return Value(flagged(np.zeros((*np.shape(constant), self.number + 1), bool), True))
 
@@ -116,7 +116,9 @@ def _cond(search: Search, equation: Any, values: list[Value]) -> list[Value]:
 def _while(search: Search, equation: Any, values: list[Value]) -> list[Value]:
     n, m = equation.params["cond_nconsts"], equation.params["body_nconsts"]
     of_condition, of_body = values[:n], values[n : n + m]
-    carry = [Value(value.depends) for value in values[n + m :]]  # known numbers are those before
+    carry = [
+        Value(value.depends) for value in values[n + m :]
+    ]  # without the values before the loop
 
     def once(carry: list[Value]) -> list[Value]:
         (condition,) = search.through(equation.params["cond_jaxpr"], of_condition + carry)
@@ -143,7 +145,7 @@ def _scan(search: Search, equation: Any, values: list[Value]) -> list[Value]:
 
 
 def _long_scan(search: Search, equation: Any, values: list[Value]) -> list[Value]:
-    """All iterations alike."""
+    """Treat all iterations alike."""
     n, m = scan_counts(equation)
     items = [Value(x.depends.any(axis=0)) for x in values[n + m :]]  # pyright: ignore[reportArgumentType]
     through = lambda carry: search.through(equation.params["jaxpr"], values[:n] + carry + items)

@@ -1,7 +1,7 @@
-"""Operations on numbers, with those on constants done while tracing.
+"""Arithmetic on numbers; operations on constants are done while tracing.
 
-Zeros that are known are taken to be exact: `0 x = 0` also where `x` is not finite. They are zeros
-of the structure, as in Jacobians and tableaus.
+Known zeros are taken to be exact: `0 x = 0` even if `x` is not finite. They are structural zeros,
+as in Jacobians and tableaus.
 """
 
 from collections.abc import Callable
@@ -68,7 +68,7 @@ def _mul(lanes: Lanes, params: Any, a: Number, b: Number) -> Number | None:
 
 
 def _logical(neutral: bool) -> Callable:
-    """`and` (`or`), in which `True` (`False`) changes nothing."""
+    """`and` (`or`); the constant `True` (`False`) is its neutral element."""
 
     def rule(lanes: Lanes, params: Any, a: Number, b: Number) -> Number | None:
         for x, y in ((a, b), (b, a)):

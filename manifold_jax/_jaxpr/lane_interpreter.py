@@ -1,4 +1,4 @@
-"""The interpreter: a traced function, evaluated with numbers instead of arrays."""
+"""The interpreter: evaluates a traced function with numbers instead of arrays."""
 
 import functools
 from collections.abc import Callable
@@ -17,15 +17,15 @@ from .primitives import MOVES
 from .trace import called, example, unrolled_scan, walk
 
 
-# Numbers of an array beyond which it stays one.
+# Arrays with more numbers than this stay whole.
 _LARGEST_ARRAY = 1000
-# Repetitions that are written out.
+# Loops with at most this many iterations are written out.
 _LONGEST_WRITTEN_OUT = 16
 
 
 def call_in_lanes(lanes: Lanes, function: Callable, *args: Any) -> Any:
-    """`function(*args)` in every lane. Leaves of `args` are [`Value`][]s, those of what is returned,
-    too. What the function closes over is the same in every lane."""
+    """Return `function(*args)` in every lane. Leaves of `args` and of the result are [`Value`][]s.
+    Arrays that the function closes over are the same in every lane."""
     leaves, treedef = jtu.tree_flatten(args)
     examples = jtu.tree_unflatten(treedef, [example(v.shape, v.dtype) for v in leaves])
     closed, shape = jax.make_jaxpr(function, return_shape=True)(*examples)
@@ -34,7 +34,7 @@ def call_in_lanes(lanes: Lanes, function: Callable, *args: Any) -> Any:
 
 
 def evaluate(lanes: Lanes, function: Any, values: list[Value]) -> list[Value]:
-    """A jaxpr, with or without its constants."""
+    """Evaluate a jaxpr, with or without its constants."""
     return walk(function, values, Value.of_constant, functools.partial(_evaluated, lanes))
 
 
@@ -54,7 +54,7 @@ def _evaluated(lanes: Lanes, equation: Any, values: list[Value]) -> list[Value]:
 
 
 def _on_whole_arrays(lanes: Lanes, equation: Any, values: list[Value]) -> list[Value]:
-    """What there is no rule for: the operation itself, mapped over the lanes."""
+    """Apply a primitive without a rule to whole arrays, mapped over the lanes."""
     lanes.whole.add(equation.primitive.name)
     lanes.count_operations(1)
 
@@ -76,7 +76,7 @@ def _linear_solve(lanes: Lanes, equation: Any, values: list[Value]) -> list[Valu
 
 
 def _cond(lanes: Lanes, equation: Any, values: list[Value]) -> list[Value]:
-    """All branches, unless it is known which is taken."""
+    """Evaluate all branches, unless the index is known."""
     which, *operands = values
     branches = equation.params["branches"]
     if which.is_known:
@@ -116,7 +116,7 @@ def _scan(lanes: Lanes, equation: Any, values: list[Value]) -> list[Value] | Non
 
 
 def _while_loop(lanes: Lanes, equation: Any, values: list[Value]) -> list[Value]:
-    """Evaluate a loop for as long as any lane goes on; the others keep what they have."""
+    """Evaluate a loop for as long as any lane goes on; the others keep their values."""
     params = equation.params
     m, n = params["cond_nconsts"], params["body_nconsts"]
     entering = lambda values: [value.entering(lanes) for value in values]

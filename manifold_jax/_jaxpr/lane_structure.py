@@ -1,4 +1,4 @@
-"""Operations that move numbers, and sums of them."""
+"""Primitives that move numbers, and sums of them."""
 
 import functools
 import math
@@ -15,7 +15,8 @@ from .primitives import arranged_factors, evaluated, sources
 
 
 def move(lanes: Lanes, equation: Any, values: list[Value]) -> list[Value] | None:
-    """`None` if it depends on numbers that are not constants where they go, or if others come in."""
+    """Move numbers. Returns `None` if the destinations depend on numbers that are not constants, or if other
+    numbers than those of the operand come in."""
     known = lambda i: values[i].known() if values[i].is_known else None
     found = sources(equation, known)
     if found is None or any((place < 0).any() for place in found[1]):
@@ -33,14 +34,14 @@ def iota(lanes: Lanes, equation: Any, values: list[Value]) -> list[Value]:
 
 
 def platform(lanes: Lanes, equation: Any, values: list[Value]) -> list[Value]:
-    """Which of several implementations is meant for the device."""
+    """Choose the implementation for the device among several."""
     for i, names in enumerate(equation.params["platforms"]):
         if names is None or jax.default_backend() in names:
             return [Value.of_constant(np.int32(i))]
     raise NotScalarError("there is no implementation for this device")
 
 
-# Products beyond which a matrix product stays one.
+# Matrix products with more multiplications than this stay whole.
 _LARGEST_DOT = 2000
 
 

@@ -1,4 +1,4 @@
-"""An array that every lane has one of, as separate numbers or as a whole."""
+"""Arrays that every lane has its own values of, as separate numbers or as a whole."""
 
 import math
 from collections.abc import Callable
@@ -15,8 +15,8 @@ from .trace import example
 
 
 class Node:
-    """An operation on numbers that is not yet given to XLA: once it is, `array` is its result. How
-    often it is used, and how many operations a copy of it would repeat."""
+    """An operation on numbers that has not been given to XLA yet; `array` is its result once it
+    has. `uses` counts how often it is used, `copied` the operations that a copy of it would repeat."""
 
     __slots__ = ("array", "copied", "dtype", "operands", "params", "primitive", "uses")
 
@@ -28,18 +28,18 @@ class Node:
                 x.uses += 1
 
 
-# A constant that is the same in every lane and known while tracing (`np.generic`), a number that is
+# One number in every lane: a constant that is known while tracing (`np.generic`), a number that is
 # the same in every lane (an array of shape ()), one for each lane (an array of shape (lanes,)), or
-# one that is still to be computed.
+# one still to be computed (`Node`).
 Number = Any
 
 
 class Value:
-    """An array of shape `shape` in each lane. `numbers()` is an object array of that shape of
-    [`Number`][]s; `whole(lanes)` an array of shape `(*shape, count)`: the lanes are contiguous in
-    memory.
+    """An array of shape `shape` in each lane, in two forms. `numbers()` is an object array of that
+    shape of [`Number`][]s; `whole(lanes)` an array of shape `(*shape, count)`: the lanes are
+    contiguous in memory.
 
-    Whichever is not there is made when it is asked for.
+    The missing form is computed lazily.
     """
 
     def __init__(self, shape: tuple[int, ...], dtype: Any, make: Callable[[], np.ndarray]):
@@ -52,7 +52,7 @@ class Value:
 
     @staticmethod
     def of_constant(x: Any) -> "Value":
-        """The same in every lane: an array, also one that is being traced."""
+        """Make a value that is the same in every lane from an array, which may be traced."""
         x = x if isinstance(x, jax.core.Tracer) else np.asarray(x)
         return Value(x.shape, x.dtype, lambda: _split(x, x.shape))
 
@@ -82,12 +82,12 @@ class Value:
         return self._whole
 
     def columns(self, lanes: Any) -> list[jax.Array]:
-        """One array of all lanes for each number."""
+        """Return one array of shape `(count,)` for each number."""
         return [lanes.array(x, self.dtype) for x in self.numbers().ravel()]
 
     def entering(self, lanes: Any) -> "Value":
-        """Return the value for the body of a loop, in which nothing may be made that is kept
-        outside."""
+        """Return the value for the body of a loop. All operations on it are done before: results
+        made inside are not known outside."""
         numbers = [lanes.emitted(x) for x in self.numbers().ravel()]
         value = Value.of_numbers(object_array(numbers, self.shape), self.dtype)
         value._whole = self._whole
@@ -95,7 +95,7 @@ class Value:
 
     @property
     def is_known(self) -> bool:
-        """Whether it is a constant, of which all can be computed while tracing."""
+        """Whether all its numbers are constants known while tracing."""
         return all(isinstance(x, np.generic) for x in self.numbers().flat)
 
     def known(self) -> np.ndarray:
@@ -103,7 +103,8 @@ class Value:
 
 
 def object_array(items: list[Any], shape: tuple[int, ...]) -> np.ndarray:
-    """Return an object array of objects that are arrays themselves, which NumPy would look into."""
+    """Return an object array of objects that are arrays themselves, which NumPy would otherwise
+    convert."""
     out = np.empty(len(items), object)
     for i, item in enumerate(items):
         out[i] = item
@@ -115,7 +116,7 @@ def _split(x: Any, shape: tuple[int, ...]) -> np.ndarray:
 
 
 class Layout(NamedTuple):
-    """How columns, one number of each lane or each trajectory, make up a tree."""
+    """The structure of a tree that is stored as columns."""
 
     treedef: Any
     shapes: tuple[tuple[int, ...], ...]
@@ -130,7 +131,7 @@ class Layout(NamedTuple):
 
     @staticmethod
     def of_one(tree: Any) -> "Layout":
-        """Return the layout of one of the trajectories that arrays have in front."""
+        """Return the layout of one trajectory of arrays with the trajectories in front."""
         return Layout.of(jtu.tree_map(lambda x: example(x.shape[1:], x.dtype), tree))
 
     def dtypes_of_columns(self) -> list[np.dtype]:
@@ -138,12 +139,12 @@ class Layout(NamedTuple):
         return [dtype for shape, dtype in each for _ in range(math.prod(shape))]
 
     def example(self) -> Any:
-        """Return an example to trace functions of one trajectory with."""
+        """Return an example with which functions of one trajectory are traced."""
         return jtu.tree_unflatten(self.treedef, list(map(example, self.shapes, self.dtypes)))
 
 
 class Columns(eqx.Module):
-    """A tree as a list of columns."""
+    """A tree as a list of columns: one array for each number, over all lanes or all trajectories."""
 
     columns: list[jax.Array]
     layout: Layout = eqx.field(static=True)

@@ -72,7 +72,7 @@ class MechanicalConstraint(AbstractConstraint):
         return Kinematics.of(self, t, y, args).structure_here() is not None
 
     def push_forward(self, t, y, args, directions, vector) -> Y:
-        """Positions first; the velocities depend on them."""
+        """Apply the derivative to the positions first; the velocities depend on them."""
         here, (e_x, e_w) = Kinematics.of(self, t, y, args), flat(vector)
         C, p = here.dense().rows()
         if p > 0:
@@ -92,7 +92,7 @@ class MechanicalConstraint(AbstractConstraint):
 def whole_structure(
     constraint: AbstractConstraint, t: RealScalarLike, y: Y, args: Args
 ) -> Structure | None:
-    """The structure of all equations with respect to the whole state, if they are sparse, too."""
+    """Return the structure of all equations with respect to the whole state, if they are sparse, too."""
     x, unravel = jfu.ravel_pytree(y)
     t = as_time(t, x.dtype)
     return structure_of(((lambda x: residual_vector(constraint, t, unravel(x), args), x),))

@@ -36,7 +36,7 @@ class Baumgarte(eqx.Module):
 
     @property
     def rate(self) -> FloatScalar:
-        """The largest modulus of the roots of `s^2 + 2 alpha s + beta^2`."""
+        """Return the largest modulus of the roots of `s^2 + 2 alpha s + beta^2`."""
         alpha, beta = jnp.asarray(self.alpha, float), jnp.asarray(self.beta, float)
         return jnp.maximum(beta, alpha + jnp.sqrt(jnp.maximum(alpha**2 - beta**2, 0)))
 

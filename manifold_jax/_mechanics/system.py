@@ -210,15 +210,15 @@ class MechanicalSystem(eqx.Module):
         return dfx.ODETerm(self._field)
 
     def accelerations(self, t: RealScalarLike, y: Y, args: Args = None) -> Y:
-        """`a` of `M a + J^T lambda = Q`, like `q`, without stabilization."""
+        """Return `a` of `M a + J^T lambda = Q`, like `q`, without stabilization."""
         motion = Motion(self, t, y, args)
         return motion.unravel(motion.solve(motion.bias)[0])
 
     def multipliers(self, t: RealScalarLike, y: Y, args: Args = None) -> Float[Array, " m"]:
-        """`lambda` of `M a + J^T lambda = Q`: first those of `position_constraint` in the order of
-        `ravel_pytree`, then those of `velocity_constraint`. The constraint force on the
-        coordinates is `-J^T lambda`. With `redundant=True` the solution with the least forces, the sum of
-        `lambda_i^2 (J M^-1 J^T)_ii`."""
+        """Return `lambda` of `M a + J^T lambda = Q`: first those of `position_constraint` in the order
+        of `ravel_pytree`, then those of `velocity_constraint`. The constraint force on the coordinates
+        is `-J^T lambda`. With `redundant=True` the solution with the least forces: the sum of
+        `lambda_i^2 (J M^-1 J^T)_ii` is minimal."""
         motion = Motion(self, t, y, args)
         return motion.solve(motion.bias)[1]
 
@@ -241,7 +241,7 @@ class MechanicalSystem(eqx.Module):
         return (rates,)
 
     def _stabilized_field(self, t: RealScalarLike, y: Y, args: Args) -> tuple[Y, Y]:
-        """The field, and the part of it that changes sign with the direction of time."""
+        """Return the field, and the part of it that changes sign with the direction of time."""
         assert isinstance(self.stabilization, Baumgarte)
         motion = Motion(self, t, y, args)
         alpha, beta = self.stabilization.alpha, self.stabilization.beta

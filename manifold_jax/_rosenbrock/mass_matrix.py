@@ -1,4 +1,4 @@
-"""`M y' = f`: the term, and its mass matrix in the forms that users give it."""
+"""The term `M y' = f`, and the forms in which users give its mass matrix."""
 
 from collections.abc import Callable
 from typing import Any, NoReturn
@@ -75,7 +75,7 @@ class MassMatrixTerm(dfx.AbstractTerm):
         return t1 - t0
 
     def prod(self, vf: Any, control: RealScalarLike) -> NoReturn:
-        """What solvers that do not know of mass matrices add to the state."""
+        """Return the increment for solvers that do not know of mass matrices."""
         raise ValueError(
             "`terms` is an `mj.MassMatrixTerm`, whose mass matrix this solver would ignore. Use `mj.Rodas5P()` or "
             "`mj.Rodas3P()`, alone or in `mj.Projected`. For another solver and a regular mass matrix solve for y' in "
@@ -103,12 +103,12 @@ class MassMatrixTerm(dfx.AbstractTerm):
         return _consistent_state(self, t, y, args, throw)
 
     def derivative(self, t: RealScalarLike, y: Y, args: Args = None) -> Y:
-        """`y'` at a consistent state; not finite where the index is above 1."""
+        """Return `y'` at a consistent state; not finite where the index is above 1."""
         x, unravel = jfu.ravel_pytree(y)
         return unravel(self.equations(y, args).at(t, x).derivative)
 
     def equations(self, y: Y, args: Args) -> Equations:
-        """The equations in the vector of all numbers of the state; `y` is an example of one."""
+        """Return the equations in the vector of all numbers of the state; `y` is an example of a state."""
         _, unravel = jfu.ravel_pytree(y)
 
         def field(t: RealScalarLike, x: Float[Array, " n"]) -> Float[Array, " n"]:
@@ -134,7 +134,7 @@ def _consistent_state(
 
 
 def ravelled_like(y: Y, value: Any) -> Float[Array, " n"]:
-    """What a vector field returned, as a vector; refused if it is not like the state."""
+    """Return the result of a vector field as a vector; refuse one that is not like the state."""
     if not are_alike(value, y):
         raise ValueError(
             f"`vector_field` must return what `y` is made of, arrays of the shapes {shapes(y)}, got {shapes(value)}."
@@ -148,7 +148,7 @@ def _ravelled(y: Y, value: Any) -> Float[Array, " n"]:
 
 
 def mass_values(mass: Any, t: RealScalarLike, y: Y, args: Args) -> Float[Array, "..."]:
-    """A scalar, a diagonal `(n,)` or a matrix `(n, n)`."""
+    """Return the mass as a scalar, a diagonal `(n,)` or a matrix `(n, n)`."""
     if callable(mass):
         mass = mass(t, y, args)
         _check_numbers(mass)

@@ -1,4 +1,4 @@
-"""The front end: `diffrax.diffeqsolve` plus what a solver cannot do by itself."""
+"""The front end: `diffrax.diffeqsolve` plus what a solver cannot do on its own."""
 
 from typing import Any
 
@@ -142,7 +142,7 @@ def diffeqsolve(
         controller_state=controller_state,
         made_jump=made_jump,
     )
-    # The dense solution, which is returned, holds the constraint that was given.
+    # The dense solution, which is returned, holds the original constraint.
     return finish(setup, ready, sol, constraint)
 
 
@@ -153,9 +153,10 @@ def _as_in_steps(
     consistent: Consistent,
     y0: Y,
 ) -> Any:
-    """The solver as it runs: with the tolerances of the controller, and accurate implicit stages."""
+    """Return the solver as it runs: with the tolerances of the controller, and accurate implicit
+    stages."""
     if isinstance(solver, AbstractManifoldSolver):
-        # Every value that is interpolated is corrected, but for those that an event is searched by.
+        # All interpolated values are corrected, except those with which an event is searched for.
         solver = solver.within(controller, bends_interpolant=event is not None)
     else:
         warn_of_unknown_hook(solver)

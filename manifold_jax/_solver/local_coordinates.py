@@ -113,10 +113,10 @@ class _DirectedCoordinates(eqx.Module):
         return self.of.lift(t * self.direction, w, args)
 
     def field(self, term: dfx.AbstractTerm, t: RealScalarLike, w: Y, args: Args) -> Any:
-        """The velocity of the coordinates, NaN where there is no lift."""
+        """Return the velocity of the coordinates, NaN where there is no lift."""
         lifted, info = self.lift(t, w, args)
-        # Evaluated at a point where it is finite, and then added to: the derivative of a NaN
-        # in a step that is rejected would otherwise be NaN, not zero.
+        # Evaluated at a point where it is finite, then made NaN by an addition: the derivative of a NaN
+        # in a rejected step would be NaN instead of zero.
         where = lambda a, b: jnp.where(info.success, a, jax.lax.stop_gradient(b))
         lifted = jtu.tree_map(where, lifted, self.centre)
         velocity = self.pull_back(t, w, lifted, term.vf(t, lifted, args))

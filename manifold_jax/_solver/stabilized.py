@@ -1,4 +1,4 @@
-"""Constraint stabilization: a vector field that is drawn to the manifold."""
+"""Constraint stabilization: a vector field that is attracted to the manifold."""
 
 from typing import Any
 
