@@ -176,7 +176,7 @@ def gradient_flow(
 
 
 def _start_faults(lagrangian: Lagrangian, start: Float[Array, " n"]) -> Bool[Array, " 4"]:
-    """Which of `_MESSAGES` apply to the start."""
+    """Return which of `_MESSAGES` apply to the start."""
     G, factorization = lagrangian.normals(start)
     level = jnp.max(jnp.abs(lagrangian.g(start)) / row_scale(G, start))
     value, slope = jax.value_and_grad(lagrangian.f)(start)
@@ -198,9 +198,10 @@ def _descend(
     tolerance: float,
     options: dict[str, Any],
 ) -> tuple[dfx.Solution, FloatScalar]:
-    """Follow the projected gradient; also the typical size of the gradient."""
+    """Follow the projected gradient; return the typical size of the gradient, too."""
     largest = lambda v: jnp.max(jnp.abs(v))
-    # A start at which `grad f` itself is (nearly) zero leaves its rounding errors as scale.
+    # If `grad f` itself is (nearly) zero at the start, only its rounding errors would be left as the
+    # scale.
     bend = jnp.max(jnp.sum(jnp.abs(jax.hessian(lagrangian.f)(start)), axis=1))
     rounding = 10 * jnp.finfo(start.dtype).eps * bend * (largest(start) + 1)
     size = jnp.maximum(largest(jax.grad(lagrangian.f)(start)), rounding / tolerance)

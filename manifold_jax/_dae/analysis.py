@@ -1,4 +1,4 @@
-"""All that is known of a system before it is evaluated."""
+"""The structural analysis of a system, before it is evaluated."""
 
 import dataclasses
 import functools
@@ -22,7 +22,7 @@ from .signature import signature, Structure
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Analysis:
-    """What follows from the occurrence of the unknowns. Compared by identity.
+    """Structure, aliases, layout and elimination of a system. Compared by identity.
 
     - `written`: the structure of all equations.
     - `unlifted`: that of the equations that are left, with the fewest differentiations.
@@ -39,7 +39,7 @@ class Analysis:
 
     @staticmethod
     def of(example: Example, occurrence: Occurrence, implicit: bool) -> "Analysis | None":
-        """`None` if the structure is singular."""
+        """Analyse equations; return `None` if the structure is singular."""
         written = Structure.of(signature(occurrence.there))
         if written is None:
             return None
@@ -54,7 +54,7 @@ class Analysis:
 
     @property
     def c(self) -> np.ndarray:
-        """How often each of the equations that are left is differentiated."""
+        """The number of differentiations of each of the equations that are left."""
         return self.layout.structure.c
 
     @property
@@ -85,17 +85,17 @@ class Analysis:
     def jets(
         self, z: Float[Array, " a"], w: Float[Array, " b"] | None, differentiations: int
     ) -> tuple[Float[Array, " n"], ...]:
-        """The derivatives of all unknowns that equations contain when they are differentiated so often,
-        as far as they are known; else zero."""
+        """Return the derivatives of all unknowns that occur in the equations differentiated up to this
+        order; zero for those that are unknown."""
         number = self.example.equations.order + 1 + differentiations
         return tuple(self.layout.jet(k)(z, w) for k in range(number))
 
     def jets_of_states(
         self, z: Float[Array, " a"], w: Float[Array, " b"] | None, differentiations: int
     ) -> tuple[Array, ...]:
-        """Return the derivatives for equations of states alone. The others, evaluated with them,
-        have to stay finite, and of moderate size where they cancel: for unknowns that are not states
-        those in `w` are taken, without derivatives, or the example."""
+        """Return the derivatives for equations of states alone. The others, evaluated with them, have
+        to stay finite, and of moderate size where they cancel: for unknowns that are not states use
+        those in `w`, without derivatives, or the example."""
         x, *others = self.jets(z, None, differentiations)
         known = self.layout.jet(0).index
         known = (known >= 0) & (known < self.layout.num_states)
@@ -113,7 +113,7 @@ class Analysis:
         first: np.ndarray | int,
         end: np.ndarray,
     ) -> Float[Array, " m"]:
-        """`F_i^(k)` for `first_i <= k < end_i`, lower derivatives first."""
+        """Return `F_i^(k)` for `first_i <= k < end_i`, lower derivatives first."""
         number = int(end.max(initial=1))
         levels = total_derivatives(equations, t, jets, args, number - 1)
         parts = [pick(levels[k], self.rows[(first <= k) & (k < end)]) for k in range(number)]

@@ -21,8 +21,8 @@ from .._constraint.checks import check_state
 
 
 def number_names(tree: Any, alone: str) -> list[str]:
-    """One for each number, in the order of `ravel_pytree`; `alone` is that of a tree that is just
-    one array."""
+    """Return a name for each number, in the order of `ravel_pytree`; `alone` is the name of a tree that
+    is a single array."""
     return [name for leaf in leaf_names(tree, alone) for name in leaf[1]]
 
 
@@ -39,13 +39,13 @@ def leaf_names(tree: Any, alone: str) -> list[tuple[str, list[str]]]:
 
 
 def listed(names: list[str], most: int = 8) -> str:
-    """List names in a message."""
+    """Join names for a message."""
     text = ", ".join(f"`{name}`" for name in names[:most])
     return text if len(names) <= most else f"{text} and {len(names) - most} more"
 
 
 class Combination(NamedTuple):
-    """Equation `row` replaced by the sum of `weight * equation` over `parts`."""
+    """Replaces equation `row` by the sum of `weight * equation` over `parts`."""
 
     row: int
     parts: tuple[tuple[int, float], ...]
@@ -56,7 +56,7 @@ class Equations(eqx.Module):
 
     function: Callable
     order: int = eqx.field(static=True)
-    shapes: Any = eqx.field(static=True)  # of `x`, a pytree of jax.ShapeDtypeStruct, hashable
+    shapes: Any = eqx.field(static=True)  # of `x`, a hashable pytree of jax.ShapeDtypeStruct
     names: "Names" = eqx.field(static=True)
     combinations: tuple[Combination, ...] = eqx.field(static=True, default=())
 

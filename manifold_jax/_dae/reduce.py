@@ -1,4 +1,4 @@
-"""From equations to a vector field on a manifold."""
+"""The front end: from equations to a vector field on a manifold."""
 
 from collections.abc import Callable
 from typing import Any, get_args, Literal, TypeAlias

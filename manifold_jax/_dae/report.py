@@ -1,4 +1,4 @@
-"""What the reduction found, for people."""
+"""The report of a reduction."""
 
 import dataclasses
 
@@ -9,7 +9,7 @@ from .equations import listed
 from .signature import ABSENT
 
 
-# Equations and unknowns up to which the whole signature matrix is printed.
+# Largest number of equations and unknowns for which the whole signature matrix is printed.
 _MOST_PRINTED = 16
 
 
@@ -96,7 +96,7 @@ class DAEReport:
         return "\n".join(lines)
 
     def _matrix(self) -> list[str]:
-        """The signature matrix with the offsets beside and below it."""
+        """Format the signature matrix with the offsets beside and below it."""
         sigma = np.where(self.sigma < 0, ".", self.sigma.astype(str))
         columns = [
             [name, *entries, str(d)]

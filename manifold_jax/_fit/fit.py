@@ -1,4 +1,4 @@
-"""The front end: parameters of an equation on a manifold from measured trajectories."""
+"""The front end: fits parameters of an equation on a manifold to measured trajectories."""
 
 from collections.abc import Callable
 from typing import Any
@@ -182,11 +182,11 @@ def fit(
 
 
 def _unknowns(objective: Any, options: Options) -> list[Any]:
-    """Return the unknowns at all starts: those of the parameters, then those of initial states,
-    which are at their guess."""
+    """Return the unknowns at all starts: those of the parameters, then those of initial states, which
+    are at their guess."""
     transform, d = objective.transform, objective.pieces.basis.shape[-1]
     states = objective.free.size * d
-    # Equations at the joints determine as many unknowns as the states there are.
+    # Each joint has as many equations as the state there has unknowns.
     unknowns = transform.start.size + states - objective.joints.size * d
     values = int(jnp.sum(objective.pieces.weights > 0))
     if values < unknowns:

@@ -1,4 +1,4 @@
-"""The loops around optimizers: history, early stop, parameters at bounds."""
+"""The loops around optimizers: history, early stopping, parameters at bounds."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -17,7 +17,7 @@ from .progress import Meter
 
 
 class Options(NamedTuple):
-    """By what, how long and how often to optimize, in which order, and where to say how far it is."""
+    """The optimizer, its limits, the order of records, and the progress meter."""
 
     optimizer: Any
     steps: int
@@ -33,7 +33,8 @@ class Options(NamedTuple):
 
 
 class Outcome(NamedTuple):
-    """The unknowns, all pieces and the loss there, the loss of each step, and how it ended."""
+    """The final unknowns, all pieces and the loss there, the loss of each step, and how the optimizer
+    ended."""
 
     u: Any
     solved: Solved
@@ -44,8 +45,8 @@ class Outcome(NamedTuple):
 
 
 def look(u: Any, objective: Objective, options: Options) -> tuple[Any, Solved]:
-    """The loss and all pieces at one point, by the program that takes steps if it can tell:
-    compiling takes longer than solving."""
+    """Return the loss and all pieces at one point, by the program that takes steps if that returns
+    them: compiling takes longer than solving."""
     if options.by_gradient:
         return _loss(u, objective)[1]
     state = _initialize(options.optimizer, u, objective)
@@ -64,8 +65,8 @@ def optimize(objective: Objective, u: Any, options: Options) -> Outcome:
 
 
 def _within_bounds(objective: Objective, u: Any, options: Options) -> Outcome:
-    """Each parameter is put on a bound at most once, and at most once taken off again, if it belongs
-    inside after the others have moved."""
+    """Optimize with bounds. Each parameter is put on a bound at most once, and at most once taken off
+    again, if it belongs inside after the others have moved."""
     transform = objective.transform
     losses, movable = [], np.ones(transform.start.size, bool)
     returning = movable.copy()
@@ -83,7 +84,7 @@ def _within_bounds(objective: Objective, u: Any, options: Options) -> Outcome:
             return found
         beside = put_beside_bounds(found.u, side, BESIDE, transform)
         step = linear_step(beside, look(beside, objective, options)[1], objective)
-        # of the distances now, those at which the linearized problem is solved
+        # of the current distances, those at which the linearized problem is solved
         left = 1 - side * step[: side.size]
         inside = (side != 0) & (left > 2) & returning
         if not np.any(inside):
@@ -96,8 +97,8 @@ def _within_bounds(objective: Objective, u: Any, options: Options) -> Outcome:
 def _with_optimistix(
     objective: Objective, u: Any, options: Options, losses: list[float], movable: np.ndarray
 ) -> Outcome:
-    """Step by step through the public methods of the solver, which return what was seen at the
-    point from which they step. Ends early where a `movable` parameter is driven to a bound."""
+    """Optimize step by step through the public methods of the solver, which return the values at the
+    point from which they step. End early if a `movable` parameter is driven to a bound."""
     solver, done, okay, message = options.optimizer, False, True, None
     state = _initialize(solver, u, objective)
     while message is None:
@@ -140,10 +141,10 @@ def _advance(solver: Any, u: Any, objective: Objective, state: Any) -> Any:
 
 
 def _closing_gaps(objective: Objective, u: Any, options: Options) -> Outcome:
-    """Multiple shooting: the states at the joints meet in the limit.
+    """Multiple shooting: close the gaps at the joints, which vanish in the limit.
 
-    An augmented Lagrangian, `sum r^2 + w^2 sum (c + s)^2`: after each fit `s` grows by the gaps
-    that are left, and `w` by ten. Source: Nocedal & Wright, Numerical Optimization, ch. 17.
+    An augmented Lagrangian, `sum r^2 + w^2 sum (c + s)^2`: after each fit `s` grows by the gaps that
+    are left, and `w` by ten. Source: Nocedal & Wright, Numerical Optimization, ch. 17.
     """
     losses = []
     for _ in range(12):
@@ -159,12 +160,12 @@ def _closing_gaps(objective: Objective, u: Any, options: Options) -> Outcome:
             ((objective.shift + gap) / 100, objective.stiffness * 10),
         )
     message = f"gaps of {size:.1e} are left between segments; take shorter ones"
-    # Next to others, it is the loss of no trajectory.
+    # Not comparable with other starts: it is the loss of no trajectory.
     return found._replace(losses=losses, loss=np.inf, success=False, message=message)
 
 
 def _with_optax(objective: Objective, u: Any, options: Options) -> Outcome:
-    """Epochs of one batch each, or of a random order of all records cut into batches."""
+    """Take epochs of one batch each, or of a random order of all records cut into batches."""
     records, size = objective.pieces.start.size, options.batch_size
     random = np.random.default_rng(options.seed)
     optimizer = optax.with_extra_args_support(options.optimizer)

@@ -1,4 +1,4 @@
-"""Rotations: matrices and unit quaternions, of which the algebra is that of vectors."""
+"""Rotations as matrices and as unit quaternions; their algebra is that of vectors."""
 
 from typing import ClassVar
 

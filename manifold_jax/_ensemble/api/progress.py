@@ -1,4 +1,4 @@
-"""How far a long run is: a bar on a terminal, lines in a file, a pipe or a notebook."""
+"""Progress of a long run: a bar on a terminal, lines in a file, a pipe or a notebook."""
 
 import time
 
@@ -6,7 +6,8 @@ from ..._base.extras import NoBar, print_line, terminal_bar
 
 
 class Meter:
-    """Silent unless `shown`. Lines are at least a second apart, and a tenth of the time gone by."""
+    """A progress meter, silent unless `shown`. Lines are at least a second and a tenth of the elapsed
+    time apart."""
 
     def __init__(self, size: int, finished: int, failed: int, shown: bool):
         self.size = size

@@ -1,4 +1,4 @@
-"""Ensembles of any size: chunk by chunk to the disk."""
+"""Ensembles of any size, written to disk chunk by chunk."""
 
 import errno
 import operator
@@ -36,7 +36,7 @@ from .settings import check_settings, settings_of
 from .solve_ensemble import DEFAULT_LANES, solve_ensemble
 
 
-# Numbers of trajectories are 32-bit integers where JAX has no others.
+# Indices of trajectories are 32-bit integers unless JAX has 64 bits enabled.
 _LARGEST_SIZE = 2**31 - 1
 
 
@@ -146,7 +146,7 @@ def stream_ensemble(
 
 
 def _compute(stored: StoredEnsemble, lowered: Any, call: Callable, progress: bool) -> None:
-    """The chunks that are not there, or not as they were written."""
+    """Compute the chunks that are missing or damaged."""
     size, chunk = stored.size, stored.chunk
     damaged = {fault.chunk for fault in faults_of_chunks(stored.group)}
     whole = [k for k in finished_chunks(stored.group) if k not in damaged]
@@ -169,7 +169,8 @@ def _compute(stored: StoredEnsemble, lowered: Any, call: Callable, progress: boo
 def _solve_chunk(
     given: dict[str, Any], key: Array, start: Array, size: int, chunk: int
 ) -> dict[str, Any]:
-    """The same program for every chunk: the last trajectory fills the last one up."""
+    """Solve a chunk. All chunks share one program: the last one is filled up with copies of the last
+    trajectory."""
     index = jnp.minimum(start + jnp.arange(chunk), size - 1)
     samples = drawn(given["sample"], given["t0"], given["t1"], key, index)
     options = {name: x for name, x in given.items() if name != "sample"} | samples
@@ -181,7 +182,7 @@ def _solve_chunk(
 def _opened(
     out: Path, settings: dict[str, Any], messages: Sequence[str], examples: Any, resume: bool
 ) -> StoredEnsemble:
-    """The folder, new or as it is, with those settings and all of its arrays."""
+    """Open the folder, new or existing, with these settings and all of its arrays."""
     with clear_write_errors(out):
         files = [file for file in out.iterdir() if file.name != LOCK_FILE]
     if all(resume and is_partial(file) for file in files):

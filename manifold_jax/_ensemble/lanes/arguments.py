@@ -1,4 +1,4 @@
-"""What each trajectory has of its own, and what all have in common."""
+"""The arguments that each trajectory has of its own, and those that are common to all."""
 
 from typing import Any
 
@@ -18,13 +18,13 @@ from ..._solve.times import is_no_step, NO_FIRST_STEP, NO_OUTPUT_TIME
 from .trajectory import end_floor, Given
 
 
-# Names of the axes of a mesh over which trajectories are shared out; none on one device.
+# Names of the axes of a mesh over which trajectories are distributed; none on one device.
 Axes = tuple[str, ...]
 
 
 def largest(x: Array, axes: Axes) -> Array:
-    """Return the largest value of all trajectories. Every process raises what one has to raise:
-    else it would wait for it."""
+    """Return the largest value over all trajectories. All processes get the same one and raise
+    together: a process that raised alone would leave the others waiting."""
     return lax.pmax(jnp.max(x), axes) if axes else jnp.max(x)
 
 
@@ -47,14 +47,14 @@ class Batch(eqx.Module):
         return given._replace(t0=t0, t1=t1)
 
     def one(self) -> Given:
-        """An example."""
+        """Return an example."""
         return self.complete(jtu.tree_map(lambda x: x[0], self.each))
 
 
 def checked_batch(
     t0: Any, t1: Any, dt0: Any, y0s: Y, args: Args, args_axes: Any, saveat: dfx.SaveAt, lanes: int
 ) -> Batch:
-    """Refuse leading axes that do not fit, naming the argument."""
+    """Check the leading axes; errors name the argument."""
     if not isinstance(lanes, int) or lanes < 1:
         raise ValueError(f"`lanes` must be a positive integer, got {lanes!r}.")
     check_state(y0s, "y0s")
@@ -111,8 +111,8 @@ def checked_times(saveat: dfx.SaveAt, batch: Batch, axes: Axes) -> dfx.SaveAt:
 
 
 def _ends(batch: Batch) -> tuple[Array, Array]:
-    """Return the ends of the time of each trajectory; where all have the same, of one: XLA takes
-    seconds to compute while compiling what thousands of equal constants amount to."""
+    """Return `t0` and `t1` of each trajectory, or of one if all have the same: XLA takes seconds to
+    fold thousands of equal constants at compile time."""
     t0, t1, *_ = batch.common
     if t0 is not None and t1 is not None:
         return jnp.asarray(t0, batch.dtype)[None], jnp.asarray(t1, batch.dtype)[None]

@@ -17,7 +17,7 @@ from .trajectory import Attempt, Equations, Given, Outcome, Start, Trajectory
 
 
 class GivenTangent(NamedTuple):
-    """What a trajectory has of its own, and its tangent; and the trajectory that this is."""
+    """The data that a trajectory has of its own, their tangent, and the trajectory that they define."""
 
     each: Any
     rest: Any
@@ -31,14 +31,14 @@ class GivenTangent(NamedTuple):
 
 
 class Moving(NamedTuple):
-    """A trajectory with the tangent of what its next step depends on."""
+    """A trajectory with the tangent of the part that its next step depends on."""
 
     trajectory: Trajectory
     tangent: Any
 
 
 class Tangents:
-    """[`Equations`][] for pairs of what they are for and its tangent, with the same steps."""
+    """The methods of [`Equations`][] for pairs of a value and its tangent, with the same steps."""
 
     def __init__(self, parts: Parts, common_tangent: Any):
         self.parts, self.common_tangent = parts, common_tangent
@@ -49,8 +49,8 @@ class Tangents:
         return GivenTangent(*of_each, *self.parts.one(each, self.parts.common, rest))
 
     def _along(self, function: Any, given: GivenTangent, x: Any, dx: Any, *args: Any) -> Any:
-        """Differentiate along a tangent: what a function returns (see `functions.py`), the tangent
-        of its real numbers between them."""
+        """Differentiate along a tangent: return the results of a function (see `functions.py`), with
+        the tangent of its real numbers between them."""
         at, along = (given.each, self.parts.common, x), (given.tangent, self.common_tangent, dx)
         return jax.jvp(self.parts.smooth(function, given.rest, *args), at, along, has_aux=True)
 
@@ -97,8 +97,8 @@ class Tangents:
 def tangents_in_lanes(
     inputs: Inputs, differentiated: Any, tangents: Any, limit: int
 ) -> tuple[Any, Any]:
-    """Return the tangents of times and values; `tangents` of the inputs have `None` where there is
-    none; `differentiated`: a tree of truth values."""
+    """Return the tangents of times and values. `tangents` of the inputs are `None` where there are
+    none; `differentiated` is a tree of Booleans."""
     parts, along = Parts.of(inputs, differentiated), Parts.of(tangents, differentiated)
     equations = Tangents(parts, along.common)
     given = parts.each, parts.rest_each, along.each

@@ -1,7 +1,7 @@
-"""What a trajectory does, as functions that are differentiated.
+"""The parts of a solve as functions that can be differentiated.
 
-Each is a `function(equations, given, x, ...)` of what steps depend on, `x`, and returns the real
-numbers among its results, and all of them.
+Each is a `function(equations, given, x, ...)`, with `x` the state on which steps depend, and returns
+the differentiable part of its results, and all results.
 """
 
 from typing import Any
@@ -15,7 +15,7 @@ from .trajectory import Equations, Given, Trajectory
 
 
 def step_state(trajectory: Trajectory) -> State:
-    """Return what a step depends on: the state, and what the solver remembers."""
+    """Return the part of a trajectory that a step depends on: the state, and the solver's memory."""
     return State(trajectory.y, memory_of(trajectory.solver_state))
 
 
@@ -25,7 +25,7 @@ def smooth_part(tree: Any) -> Any:
 
 
 def begin(equations: Equations, given: Given, x: None) -> tuple[Any, Any]:
-    """The state before the first step; and the start."""
+    """Return the state before the first step; and the start."""
     start = equations.begin(given)
     return smooth_part(step_state(start.trajectory)), start
 
@@ -33,8 +33,8 @@ def begin(equations: Equations, given: Given, x: None) -> tuple[Any, Any]:
 def step(
     equations: Equations, given: Given, smooth: State, rest: State, solver_state: Any, *ends: Any
 ) -> tuple[Any, Any]:
-    """The state behind a step and the data of its interpolation; and these data. `solver_state` is
-    one for what is not remembered of it."""
+    """Return the state after a step and the data of its interpolation; and these data. `solver_state`
+    is an example, for the parts that are not in the solver's memory."""
     terms, (start, end) = directed(equations.terms, given.direction), ends
     solve = Solve(terms, equations.solver, given.args, solver_state, remembers=True, jumps=False)
     after, dense_info = solve.attempt(start, end, False, eqx.combine(smooth, rest))
@@ -49,11 +49,11 @@ def interpolate(
     start: FloatScalar,
     end: FloatScalar,
 ) -> tuple[Any, None]:
-    """The state at a time in a step."""
+    """Return the state at a time in a step."""
     return equations.interpolated(t, start, end, dense_info), None
 
 
 def save(equations: Equations, given: Given, y: Any, t: FloatScalar) -> tuple[Any, Any]:
-    """What is saved of a state at time `t`; and whether it is on the manifold."""
+    """Return the saved value of a state at time `t`; and whether it is on the manifold."""
     value, success = equations.saved_value(given, t, y)
     return smooth_part(value), (value, success)

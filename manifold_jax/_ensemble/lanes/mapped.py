@@ -1,4 +1,4 @@
-"""The ordinary way: `diffeqsolve` for each trajectory, some of them at a time."""
+"""Solving many trajectories with `diffeqsolve` under `jax.lax.map`, in batches."""
 
 from typing import Any
 
@@ -55,6 +55,6 @@ def gradient_of_mapped(inputs: Inputs, differentiated: Any, bar: Any) -> Any:
 
 
 def tangents_of_mapped(inputs: Inputs, tangents: Any) -> Any:
-    """Return the tangents of times and values; `tangents` of the inputs have `None` where there is
+    """Return the tangents of times and values. `tangents` of the inputs are `None` where there are
     none."""
     return eqx.filter_jvp(_times_and_values, (inputs,), (tangents,))[1]

@@ -1,4 +1,4 @@
-"""What the reverse sweep of an ensemble begins with, carries along, and keeps of the forward one."""
+"""The data of the reverse sweep of an ensemble."""
 
 from typing import Any, NamedTuple
 

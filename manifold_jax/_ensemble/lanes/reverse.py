@@ -58,14 +58,16 @@ class ReverseSweep:
             of(x) for x in (ends.start.y, ends.first_bar, ends.last_bar)
         )
         self.common = jtu.tree_map(Value.of_constant, parts.common)
-        common = Columns.of_values(self.common, self.lanes)  # not in a loop first
+        common = Columns.of_values(
+            self.common, self.lanes
+        )  # not inside a loop
         self.no_common = jtu.tree_map(jnp.zeros_like, common)
         self.values_bar = of(jtu.tree_map(lambda x: x.reshape(-1, *x.shape[2:]), ends.values_bar))
         self.smooth_layout = Layout.of_one(smooth_part(step_state(ends.start)))
         self.needed = self._needed()
 
     def run(self) -> tuple[Any, Any]:
-        """Cotangents of `parts.each` and of `parts.common`."""
+        """Return the cotangents of `parts.each` and of `parts.common`."""
         count = self.lanes.count
         groups = -(-self.size // count)
         order = jnp.argsort(self.ends.num_steps)
@@ -159,7 +161,7 @@ class ReverseSweep:
                 through = lambda bars, step: self._through_step(group, step, bars)
                 bars = rows_backwards(record, num_rows, through, bars)
                 write = lambda x, new: x.at[k + 1].set(new, mode="drop")
-                # The last one is not read again in the reverse sweep.
+                # The state after the last segment is dropped.
                 firsts = jtu.tree_map(write, firsts, Stacked.of(state))
                 return jnp.where(onwards, k + 1, k - 1), onwards, firsts, record, bars
 

@@ -16,12 +16,13 @@ from .columns import empty_table, read, Stacked, taken, unknown, written
 from .trajectory import Start
 
 
-# Steps between two looks at which lanes have ended. A lane waits half of them on average.
+# Number of steps between refills of the lanes that have ended. A lane waits half of them on average.
 _STEPS = 8
 
 
 class Lane(NamedTuple):
-    """All lanes: which trajectory each has, its own data and state, and the next time to save at."""
+    """What the lanes hold: the number of the trajectory in each, its own data and state, and the next
+    time to save at."""
 
     number: Array
     given: Columns
@@ -30,8 +31,8 @@ class Lane(NamedTuple):
 
 
 class Totals(NamedTuple):
-    """What is known of all trajectories: the outcomes so far, how many times to save at were
-    reached, and the table of states there; the next trajectory to take, and how many have ended."""
+    """Results of all trajectories so far: the outcomes, how many times to save at were reached, and the
+    table of states there; the next trajectory to take, and how many have ended."""
 
     outcomes: Columns
     rows: Array
@@ -41,11 +42,12 @@ class Totals(NamedTuple):
 
 
 class Run(NamedTuple):
-    """All trajectories, in front of every array. How many of the times to save at each has reached; the
-    states there, as they were interpolated (a table, in its rows the times of one trajectory after
-    those of the other), what was returned, and whether some of it could not be corrected."""
+    """The results of all trajectories, which are the leading axis of every array. `rows`: how many of
+    the times to save at each has reached. `states`: a table of the interpolated states there,
+    trajectory after trajectory, with a row for each time. `values`: what is saved of them, `failed`:
+    whether any of these could not be corrected."""
 
-    start: Any  # `Start` and `Outcome`, or what the equations have in their place
+    start: Any  # `Start` and `Outcome`, or those of other `equations`
     outcome: Any
     rows: Array
     states: Stacked | None
@@ -54,9 +56,12 @@ class Run(NamedTuple):
 
 
 class Schedule:
-    """`equations` are [`Equations`][], or have their methods; `given` is what each trajectory has of
-    its own, the trajectories in front of every array; `complete` makes of that of one what the
-    methods are given."""
+    """Runs all trajectories.
+
+    - `equations`: [`Equations`][], or an object with the same methods.
+    - `given`: the data that each trajectory has of its own, with the trajectories in front.
+    - `complete`: maps the data of one trajectory to the first argument of these methods.
+    """
 
     def __init__(self, equations: Any, given: Any, complete: Any, limit: int):
         self.equations, self.complete = equations, complete
@@ -105,7 +110,7 @@ class Schedule:
         return value.columns(self.lanes)[0]
 
     def _of_all(self, function: Callable) -> Any:
-        """`function(index)` for all trajectories, as many of them at a time as there are lanes."""
+        """Return `function(index)` for all trajectories, as many of them at a time as there are lanes."""
         pieces = -(-self.size // self.count)
         index = jnp.minimum(jnp.arange(pieces * self.count), self.size - 1)
         return lax.map(function, index.reshape(pieces, self.count))
@@ -124,7 +129,7 @@ class Schedule:
         return outcomes, Layout.of(self.equations.state_of(trajectory))
 
     def _handed_out(self, rows: Array, states: Stacked, firsts: Columns) -> tuple[Any, Array]:
-        """What is saved of the states, time by time; lanes go together."""
+        """Return the saved values of the states, time by time, and whether any could not be corrected."""
         times = self.ts.size
 
         def of_lanes(index: Array) -> tuple[Array, Columns]:
@@ -165,8 +170,9 @@ class Schedule:
             return lane._replace(state=where(active, after, lane.state)), states
 
     def _save(self, lane: Lane, states: Stacked, tried: Any, active: Array) -> tuple[Lane, Stacked]:
-        """States at the times in this step. What takes long, their correction, is left for later: here it
-        would be done for all lanes whenever one of them has something to save."""
+        """Save the interpolated states at the times in this step. The expensive part, their correction,
+        is left for later: here it would be done for all lanes whenever one of them has something to
+        save."""
         kept = active & self._column(tried.kept)
         end, start = self._column(tried.end), self._column(tried.start)
         info = Columns.of_values(tried.dense_info, self.lanes)

@@ -1,7 +1,7 @@
-"""One trajectory as functions of arrays: how it begins, one attempted step, a value inside it.
+"""One trajectory as functions of arrays: its start, one attempted step, a value inside it.
 
-What `diffrax.diffeqsolve` does in its loop, through the public methods of solvers and controllers, so
-that many of them can be advanced by a loop of another kind.
+The loop of `diffrax.diffeqsolve`, taken apart through the public methods of solvers and controllers, so
+that another loop can advance many trajectories.
 """
 
 from typing import Any, NamedTuple
@@ -24,7 +24,7 @@ from ..._solver.step.advance import HookState, StepStatistics
 
 
 class Trajectory(NamedTuple):
-    """Between two steps, with times that increase."""
+    """The state of a trajectory between two steps, with times that increase."""
 
     tprev: FloatScalar
     tnext: FloatScalar
@@ -37,7 +37,7 @@ class Trajectory(NamedTuple):
 
 
 class Given(NamedTuple):
-    """What a trajectory is defined by, besides what all have in common."""
+    """The data that define a trajectory, besides those that all have in common."""
 
     t0: FloatScalar
     t1: FloatScalar
@@ -56,7 +56,8 @@ class Start(NamedTuple):
 
 
 class Attempt(NamedTuple):
-    """What a step led to; whether it was kept, where it ended if so, and its interpolation."""
+    """The result of a step: the trajectory after it, whether it was kept, its times and its
+    interpolation."""
 
     trajectory: Trajectory
     kept: BoolScalar
@@ -66,7 +67,7 @@ class Attempt(NamedTuple):
 
 
 class Outcome(NamedTuple):
-    """The outcome of a trajectory that has ended."""
+    """The end of a trajectory."""
 
     t: FloatScalar
     y: Y
@@ -77,10 +78,10 @@ class Outcome(NamedTuple):
 
 
 class Equations(eqx.Module):
-    """What all trajectories have in common."""
+    """The settings that all trajectories have in common."""
 
     terms: dfx.AbstractTerm
-    solver: Any  # for lanes one of this library, else any of Diffrax
+    solver: Any  # in lanes one of this library, else any of Diffrax
     controller: dfx.AbstractStepSizeController
     saveat: dfx.SaveAt
     dt0: RealScalarLike | None
@@ -133,7 +134,7 @@ class Equations(eqx.Module):
         )
         kept = jnp.asarray(kept)
         tprev = jnp.minimum(tprev, t1)
-        # A step that ends just short of the end would leave one of a few rounding errors.
+        # A step that ends just before the end would leave one of a few rounding errors.
         last = jnp.where(kept, t1, tprev + 0.5 * (t1 - tprev))
         tnext = jnp.where(tnext > given.end_floor, last, tnext)
         keep = lambda a, b: jnp.where(kept, a, b)
@@ -156,11 +157,12 @@ class Equations(eqx.Module):
     def interpolated(
         self, t: FloatScalar, start: FloatScalar, end: FloatScalar, dense_info: Any
     ) -> Y:
-        """The state inside a step, as the solver interpolates it. Times increase."""
+        """Return the state inside a step, as the solver interpolates it. Times increase."""
         return self.solver.interpolation_cls(t0=start, t1=end, **dense_info).evaluate(t)
 
     def saved_value(self, given: Given, t: FloatScalar, y: Y) -> tuple[Any, BoolScalar]:
-        """What is saved of such a state, and whether it is on the manifold. `t` is the true time."""
+        """Return the saved value of such a state, and whether it is on the manifold. `t` is the true
+        time."""
         success = jnp.asarray(True)
         if self.solver.corrects_output:
             y, info = self.solver.correct(t, y, given.args)
@@ -179,10 +181,10 @@ class Equations(eqx.Module):
 
 
 def end_floor(t0: Array, t1: Array) -> Array:
-    """The hundredth number below `t1`, where time increases: steps that would end beyond it end at
-    `t1`, as in `diffrax.diffeqsolve`. Numbers are counted as the integers of their bits."""
+    """Return the hundredth floating-point number before `t1`, in increasing time: steps that would end
+    after it end at `t1`, as in `diffrax.diffeqsolve`. Counted in the integers of their bits."""
     end = lax.stop_gradient(jnp.where(t0 < t1, t1, -t1))
-    tiny = jnp.finfo(end.dtype).tiny  # smaller numbers are zero to XLA
+    tiny = jnp.finfo(end.dtype).tiny  # XLA flushes smaller numbers to zero
     first = jnp.where(end == 0, -tiny, jnp.nextafter(end, -jnp.inf))
     bits = lax.bitcast_convert_type(first, f"int{8 * end.dtype.itemsize}")
     bits = jnp.where(first > 0, bits - 99, bits + 99)

@@ -1,4 +1,4 @@
-"""Ensembles on the disk: arrays in a folder, in the format Zarr."""
+"""Ensembles on disk: arrays in a folder, in the format Zarr."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -60,12 +60,14 @@ class StoredEnsemble:
 
     @property
     def finished(self) -> int:
-        """Chunks are written one after the other, `result` as the last array of each."""
+        """The number of trajectories computed so far. Chunks are written in order, `result` as the last
+        array of each."""
         ends = ((k + 1) * self.chunk for k in finished_chunks(self.group))
         return sum(self.chunk - max(0, end - self.size) for end in ends)
 
     def faults(self) -> list[Fault]:
-        """Which files are missing or damaged; reads all of them. `str` of each says so."""
+        """Return the files that are missing or damaged, reading all of them; `str` of a fault describes
+        it."""
         path = Path(self.group.store.root)
         return faults_of_descriptions(path, dict(self.group.attrs)) or faults_of_chunks(self.group)
 
@@ -74,7 +76,7 @@ class StoredEnsemble:
         return sum(int(np.count_nonzero(codes)) for _, codes in self._codes())
 
     def failures(self, most: int = 10) -> list[tuple[int, str]]:
-        """Numbers and reasons of the first that failed, as of [`EnsembleSolution`][]."""
+        """Return indices and reasons of the first that failed, as [`EnsembleSolution`][] does."""
         out: list[tuple[int, str]] = []
         for start, codes in self._codes():
             for i in np.flatnonzero(codes)[: most - len(out)]:
@@ -84,7 +86,7 @@ class StoredEnsemble:
         return out
 
     def failures_by_reason(self, most: int = 3) -> dict[str, tuple[int, list[int]]]:
-        """Return for each reason how many failed, and the numbers of the first."""
+        """Return for each reason how many failed, and the indices of the first."""
         counts: dict[int, int] = {}
         first: dict[int, list[int]] = {}
         for start, codes in self._codes():
@@ -135,7 +137,7 @@ def open_ensemble(path: str | Path, *, check: bool = True) -> StoredEnsemble:
 
 
 def stored_at(path: Path, mode: str = "r") -> StoredEnsemble | None:
-    """`None` if there is none."""
+    """Open an ensemble without checks; `None` if there is none."""
     package = zarr()
     if described(path) is None:
         return None
