@@ -1,4 +1,4 @@
-"""Rigid bodies: what a user says of each, and the arrays of all of them."""
+"""Rigid bodies: the descriptions that users give, and the arrays of all of them."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -94,7 +94,7 @@ class Body(eqx.Module):
 
 
 def check_orientation(what: str, value: Any, planar: bool) -> Float[Array, "..."]:
-    """An angle, or a unit quaternion."""
+    """Check an angle, or a unit quaternion."""
     if planar:
         return check_shape(what, value, (), advice=", an angle")
     p = check_shape(what, value, (4,), advice=", a unit quaternion")
@@ -137,8 +137,8 @@ def _matrix(inertia: Array) -> Any:
 
 
 class Bodies(eqx.Module):
-    """The arrays of all bodies: masses `(N,)`, moments of inertia `(N,)` or matrices `(N, 3, 3)`,
-    and the drawing."""
+    """The arrays of all bodies: masses `(N,)`, moments of inertia `(N,)` or matrices `(N, 3, 3)`, and
+    the drawing."""
 
     names: tuple[str, ...] = eqx.field(static=True)
     mass: Float[Array, " n"]
@@ -184,11 +184,12 @@ class Bodies(eqx.Module):
         return i
 
     def mass_matrix(self, q: Pose) -> Any:
-        """A diagonal in the plane; in space blocks `diag(m, 4 G^T I G + 4 c p p^T)`, inverted.
+        """Return a diagonal in the plane; in space the inverses of blocks
+        `diag(m, 4 G^T I G + 4 c p p^T)`.
 
-        The last term is without effect, as the norm of `p` is constant, and makes the matrix
-        regular: without it no force is needed to stretch a quaternion. `c` is the mean moment. As the
-        rows of `G` and `p` are orthogonal, of length `|p|`, the inverse of such a block is
+        The last term has no effect, as the norm of `p` is constant, and makes the matrix nonsingular:
+        without it no force is needed to stretch a quaternion. `c` is the mean moment. As the rows of
+        `G` and `p` are orthogonal, of length `|p|`, the inverse of such a block is
         `diag(1/m, (G^T I^-1 G + p p^T / c) / (4 |p|^4))`.
         """
         if self.planar:
@@ -209,7 +210,7 @@ class Bodies(eqx.Module):
         return InvertedBlocks(blocks, symmetric, positive & jnp.all(self.mass > 0))
 
     def gyroscopic(self, q: Pose, v: Pose) -> Float[Array, "..."]:
-        """`-8 G(p')^T I G(p) p'` of every quaternion; nothing in the plane."""
+        """Return `-8 G(p')^T I G(p) p'` of every quaternion; zeros in the plane."""
         if self.planar:
             return jnp.zeros_like(q.orientation)
         G, rates = rates_matrix(q.orientation), rates_matrix(v.orientation)

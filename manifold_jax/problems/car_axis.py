@@ -43,7 +43,7 @@ def _mass(q: Vector, args: CarAxisArgs) -> FloatScalar:
 
 
 def _wheel(t: RealScalarLike, args: CarAxisArgs) -> tuple[FloatScalar, FloatScalar]:
-    """The right wheel, on the road."""
+    """Return the position of the right wheel, on the road."""
     y = args.road_amplitude * jnp.sin(args.road_frequency * t)
     return jnp.sqrt(args.length**2 - y**2), y
 

@@ -40,7 +40,8 @@ def _mass(q: Points, args: ChainArgs) -> Points:
 
 
 def _rods(t: RealScalarLike, q: Points, args: ChainArgs) -> Float[Array, " N"]:
-    # As a sum over an axis XLA would give it to a library, which does not fuse with what is around.
+    # For a sum over an axis XLA would call a library, which does not fuse with the surrounding
+    # operations.
     x, y = _links(q).T
     return 0.5 * (x * x + y * y - args.lengths**2)
 
@@ -51,14 +52,14 @@ def _force(t: RealScalarLike, q: Points, v: Points, args: ChainArgs) -> Points:
 
 
 def _initial_state(args: ChainArgs, start: State) -> State:
-    """The angles of the links and their rates, with the lengths of `args`."""
+    """Return the state for the angles of the links and their rates, with the lengths of `args`."""
     links, rates = _links(start[0]), _links(start[1])
     stretch = (args.lengths / jnp.sqrt(jnp.sum(links * links, axis=1)))[:, None]
     return _points(stretch * links), _points(stretch * rates)
 
 
 def _exact(t: np.ndarray, args: ChainArgs, y0: Any) -> tuple[np.ndarray, np.ndarray]:
-    """The equations of motion of the angles `p_i` of the links from the downward vertical,
+    """Integrate the equations of motion of the angles `p_i` of the links from the downward vertical,
     with the mass `M_i` that link `i` carries, `M_ij = M_max(i,j)`, and the lengths `L_i`:
 
     sum_j M_ij L_i L_j (cos(p_i - p_j) p_j'' + sin(p_i - p_j) p_j'^2) = -g M_i L_i sin p_i.

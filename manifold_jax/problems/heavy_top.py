@@ -62,7 +62,7 @@ def _norm(t: RealScalarLike, q: Vector, args: HeavyTopArgs) -> FloatScalar:
 
 
 def _weight(q: Vector, args: HeavyTopArgs) -> FloatScalar:
-    """The potential energy."""
+    """Return the potential energy."""
     a, b, c, d = q[0], q[1], q[2], q[3]
     vertical = [2 * (b * d - a * c), 2 * (c * d + a * b), a**2 - b**2 - c**2 + d**2]
     return args.mass * args.gravity * jnp.sum(jnp.stack(vertical) * args.center)
@@ -76,7 +76,7 @@ def _force(t: RealScalarLike, q: Vector, v: Vector, args: HeavyTopArgs) -> Vecto
 
 
 def _exact(t: np.ndarray, args: HeavyTopArgs, y0: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Euler's equations and the kinematics of the quaternion, `p = (a, b, c, d)`,
+    """Integrate Euler's equations and the kinematics of the quaternion, `p = (a, b, c, d)`,
     `I w' = (I w) x w + c x weight`, `2 p' = p w`."""
     I1, I2, I3 = args.inertia.tolist()
     load = (float(args.mass * args.gravity) * args.center).tolist()
@@ -101,7 +101,7 @@ def _exact(t: np.ndarray, args: HeavyTopArgs, y0: Any) -> tuple[np.ndarray, np.n
 
 
 def _quaternion_rates(x: Sequence[Any]) -> tuple[Any, Any, Any, Any]:
-    """The product of quaternions `p w / 2` of `x = (p, w)`, numbers or arrays."""
+    """Return the product of quaternions `p w / 2` of `x = (p, w)`, numbers or arrays."""
     a, b, c, d, w1, w2, w3 = x
     return (
         0.5 * (-b * w1 - c * w2 - d * w3),

@@ -46,7 +46,7 @@ def _initial_state(args: KeplerArgs, start: State | None) -> State:
 
 
 def _exact(t: np.ndarray, args: KeplerArgs, y0: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Kepler's equation, then the functions of Lagrange: `q = f q0 + g v0`."""
+    """Solve Kepler's equation; then the functions of Lagrange give `q = f q0 + g v0`."""
     mu = float(args.mu)
     q0, v0 = y0
     r0 = np.hypot(*q0)

@@ -42,7 +42,8 @@ def _force(t: RealScalarLike, q: Vector, v: Vector, args: RollingDiscArgs) -> Ve
 
 
 def _initial_state(args: RollingDiscArgs, start: State) -> State:
-    """The position and the two angular velocities of `start`, rolling without slipping."""
+    """Return the state for the position and the two angular velocities in `start`, rolling without
+    slipping."""
     q, v = start
     speed = args.radius * v[3]
     return q, jnp.stack([speed * jnp.cos(q[2]), speed * jnp.sin(q[2]), v[2], v[3]])

@@ -79,8 +79,8 @@ def _initial_state(args: SliderCrankArgs, start: State | None) -> State:
 
 
 def _configuration(xp: ModuleType, crank: Any, a: Any, side: Any) -> tuple[Any, ...]:
-    """Slider and rod for a crank angle, then their first and second derivatives by it, in NumPy or
-    JAX; `side` is the sign of the cosine of the rod's angle."""
+    """Return slider and rod for a crank angle, then their first and second derivatives with respect to
+    it, in NumPy or JAX; `side` is the sign of the cosine of the rod's angle."""
     s, c = xp.sin(crank), xp.cos(crank)
     sin_rod = -a * s
     cos_rod = side * xp.sqrt(1 - sin_rod**2)
@@ -93,7 +93,7 @@ def _configuration(xp: ModuleType, crank: Any, a: Any, side: Any) -> tuple[Any, 
 
 
 def _exact(t: np.ndarray, args: SliderCrankArgs, y0: Any) -> tuple[np.ndarray, np.ndarray]:
-    """The equation of motion of the crank angle, `B = dq / d crank`:
+    """Integrate the equation of motion of the crank angle, `B = dq / d crank`:
 
     (B.M B) crank'' = B.Q - (B.M dB/d crank) crank'^2.
     """

@@ -16,7 +16,8 @@ State: TypeAlias = tuple[Pose, Pose]
 
 CYLINDERS = tuple(f"cylinder {i}" for i in range(1, 7))
 PISTONS = tuple(f"piston {i}" for i in range(1, 7))
-# Of the joints at base and platform, seen from above: pairs, at the platform turned by 60 degrees.
+# Angles of the joints at base and platform, seen from above: pairs, at the platform turned by 60
+# degrees.
 AT_BASE = tuple(math.radians(120 * (i // 2) + (-15, 15)[i % 2]) for i in range(6))
 AT_PLATFORM = tuple(math.radians(120 * (i // 2) + (-45, 45)[i % 2]) for i in range(6))
 # Centres of mass of cylinders and pistons from their ends, and their moments of inertia across
@@ -40,7 +41,8 @@ class StewartPlatformArgs(NamedTuple):
 
 
 def _points(xp: Any, args: Any) -> tuple[Any, Any, Any]:
-    """Joints at the base, in the platform's frame, and the first axes of the universal joints."""
+    """Return joints at the base, joints in the platform's frame, and the first axes of the universal
+    joints."""
     dtype = args.base_radius.dtype
     circle = lambda angles: xp.asarray(
         np.stack([np.cos(angles), np.sin(angles), np.zeros(6)], axis=1), dtype
@@ -53,8 +55,8 @@ def _points(xp: Any, args: Any) -> tuple[Any, Any, Any]:
 
 
 def _legs(xp: Any, base: Any, ends: Any, first_axes: Any) -> tuple[Any, Any]:
-    """Lengths and frames of the legs, `(6, 3, 3)`: the columns are the second axis of the universal
-    joint, the normal of both, and the direction of the leg. Also of complex numbers."""
+    """Return lengths and frames of the legs, `(6, 3, 3)`: the columns are the second axis of the
+    universal joint, the normal of both, and the direction of the leg. Also for complex numbers."""
     span = ends - base
     length = xp.sqrt(xp.sum(span * span, axis=-1))
     n = span / length[:, None]
@@ -64,9 +66,9 @@ def _legs(xp: Any, base: Any, ends: Any, first_axes: Any) -> tuple[Any, Any]:
 
 
 def _leg_motion(xp: Any, points: tuple, x: Any, R: Any, u: Any, w: Any) -> tuple[Any, ...]:
-    """Of position, rotation and twists `(..., 3)` of the platform: the upper ends of the legs and
-    their velocities, the frames of the legs, rates of the directions, and angular velocities.
-    The universal joint decides about the spin: its second axis stays perpendicular to its first."""
+    """Return, for position, rotation and twists `(..., 3)` of the platform, the upper ends of the legs
+    and their velocities, the frames of the legs, rates of the directions, and angular velocities. The
+    universal joint determines the spin: its second axis stays perpendicular to its first."""
     base, local, first_axes = points
     arms = local @ R.T
     ends = arms + x[None, :]
@@ -81,7 +83,7 @@ def _leg_motion(xp: Any, points: tuple, x: Any, R: Any, u: Any, w: Any) -> tuple
 
 
 def assembly(args: StewartPlatformArgs) -> Assembly:
-    """The platform as drawn: level, at its height."""
+    """Return the platform as drawn: level, at its height."""
     base, local, first_axes = _points(jnp, args)
     zero = jnp.zeros_like(args.height)
     center = jnp.stack([zero, zero, args.height])
@@ -117,14 +119,14 @@ def _quaternions(xp: Any, frames: Any) -> Any:
 
 
 def _spinning(xp: Any, p: Any, spin: Any) -> Any:
-    """Rates of quaternions for angular velocities in space."""
+    """Return rates of quaternions for angular velocities in space."""
     a, v = p[..., :1], p[..., 1:]
     scalar = -xp.sum(v * spin, axis=-1)[..., None]
     return xp.concatenate([scalar, a * spin + xp.cross(spin, v)], axis=-1) / 2
 
 
 def _spin(xp: Any, p: Any, p_rate: Any) -> Any:
-    """The angular velocity in space."""
+    """Return the angular velocity in space."""
     return 2 * (p[0] * p_rate[1:] - p_rate[0] * p[1:] + xp.cross(p[1:], p_rate[1:]))
 
 
@@ -136,13 +138,13 @@ def _rotation(xp: Any, p: Any) -> Any:
 
 
 def _initial_state(args: StewartPlatformArgs, start: State) -> State:
-    """Pose and velocities of the platform of `start`, with the lengths of `args`."""
+    """Return the state for pose and velocities of the platform in `start`, with the lengths of `args`."""
     q, v = start
     return _bodies(jnp, q.position[0], q.orientation[0], v.position[0], v.orientation[0], args)
 
 
 def _bodies(xp: Any, x: Any, p: Any, u: Any, p_rate: Any, args: Any) -> State:
-    """All bodies, from the platform."""
+    """Return all bodies, from the platform."""
     points = _points(xp, args)
     base, R, spin = points[0], _rotation(xp, p), _spin(xp, p, p_rate)
     ends, moving, frames, turning, spins = _leg_motion(xp, points, x, R, u, spin)
@@ -157,8 +159,8 @@ def _bodies(xp: Any, x: Any, p: Any, u: Any, p_rate: Any, args: Any) -> State:
 
 
 def _exact(t: np.ndarray, args: StewartPlatformArgs, y0: Any) -> State:
-    """Kane's equations of the platform alone, whose twist decides about the velocities of all bodies;
-    the accelerations that are left when its twist is constant by a complex step."""
+    """Integrate Kane's equations of the platform alone, whose twist determines the velocities of all
+    bodies; the accelerations that are left when its twist is constant by a complex step."""
     q, v = y0
     twist = _twist_equation(args)
     x, p, u, p_rate = q.position[0], q.orientation[0], v.position[0], v.orientation[0]
@@ -176,7 +178,7 @@ def _exact(t: np.ndarray, args: StewartPlatformArgs, y0: Any) -> State:
 
 
 def _twist_equation(args: StewartPlatformArgs) -> Any:
-    """The acceleration and angular acceleration of the platform."""
+    """Return the acceleration and angular acceleration of the platform."""
     base, local, first_axes = points = _points(np, args)
     size, tiny = float(args.platform_radius), 1e-30
     masses = np.array([args.platform_mass] + [args.leg_mass] * 12)

@@ -58,9 +58,7 @@ class ReverseSweep:
             of(x) for x in (ends.start.y, ends.first_bar, ends.last_bar)
         )
         self.common = jtu.tree_map(Value.of_constant, parts.common)
-        common = Columns.of_values(
-            self.common, self.lanes
-        )  # not inside a loop
+        common = Columns.of_values(self.common, self.lanes)  # not inside a loop
         self.no_common = jtu.tree_map(jnp.zeros_like, common)
         self.values_bar = of(jtu.tree_map(lambda x: x.reshape(-1, *x.shape[2:]), ends.values_bar))
         self.smooth_layout = Layout.of_one(smooth_part(step_state(ends.start)))

@@ -1,4 +1,4 @@
-"""`manifold-jax animate`: what drift looks like."""
+"""`manifold-jax animate`: drift made visible."""
 
 from pathlib import Path
 from typing import Annotated

@@ -29,7 +29,7 @@ app = typer.Typer(
     "Computes in double precision.",
     no_args_is_help=True,
     add_completion=False,
-    rich_markup_mode="markdown",  # which joins the lines of a paragraph
+    rich_markup_mode="markdown",  # joins the lines of a paragraph
     pretty_exceptions_show_locals=False,
 )
 

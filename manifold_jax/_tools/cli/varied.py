@@ -39,7 +39,7 @@ class Distribution(NamedTuple):
         return f"{self.target}={self.kind}({self.a}, {self.b})"
 
 
-# Of each what its two numbers have to be.
+# What the two numbers of each kind have to be.
 _KINDS = {
     "uniform": ("uniform(low, high) needs low < high", lambda a, b: a < b),
     "normal": ("normal(mean, std) needs std > 0", lambda a, b: b > 0),
@@ -49,8 +49,7 @@ _HINT = "--vary"
 
 
 def distributions(texts: list[str], problem: Problem) -> list[Distribution]:
-    """Read a distribution of `NAME=KIND(A,B)` each, or an error that says what could have been
-    asked for."""
+    """Read distributions from `NAME=KIND(A,B)`, or raise an error that lists the valid ones."""
     known = [*_names_in("args", problem.args), *_names_in("y0", problem.y0)]
     out: list[Distribution] = []
     for text in texts:
@@ -68,7 +67,7 @@ def distributions(texts: list[str], problem: Problem) -> list[Distribution]:
     return out
 
 
-# Parts of names whose numbers have a sign: of a negative mass there is a solution, but no mechanism.
+# Parts of the names of positive numbers: with a negative mass there is a solution, but no mechanism.
 _POSITIVE = ("length", "mass", "inertia", "radius")
 
 
@@ -94,8 +93,8 @@ def _numbers(text: str, kind: str, *words: str) -> tuple[float, float]:
 
 
 class Given(NamedTuple):
-    """What one trajectory has of its own besides its start: parameters, the arrays of its
-    constraint (values of invariants) and what was drawn, by name."""
+    """The data that one trajectory has of its own besides its start: parameters, the arrays of its
+    constraint (values of invariants) and the drawn numbers, by name."""
 
     args: Any
     constraint: Any
@@ -130,13 +129,13 @@ class VariedProblem:
         return problem.y0, Given(problem.args, eqx.filter(problem.constraint, eqx.is_array), drawn)
 
     def saved(self, t: Any, y: Any, given: Given) -> dict[str, Any]:
-        """The state, by how much it violates the constraint (absolute), and what was drawn."""
+        """Return the state, its (absolute) constraint violation, and the drawn numbers."""
         residual = jfu.ravel_pytree(self.constraint(t, y, given))[0]
         return {"y": y, "violation": jnp.max(jnp.abs(residual)), "varied": given.drawn}
 
 
 class ConstraintInArgs(AbstractConstraint):
-    """A constraint whose arrays are those of each trajectory, in [`Given`][]."""
+    """A constraint whose arrays are taken from the [`Given`][] of each trajectory."""
 
     template: AbstractConstraint
     redundant: bool = eqx.field(static=True)
@@ -164,7 +163,7 @@ class ConstraintInArgs(AbstractConstraint):
 
 
 def _names_in(name: str, tree: Any) -> list[str]:
-    """The names of the numbers in a tree, in the order in which it is ravelled: `args.length`,
+    """Return the names of the numbers in a tree, in the order in which it is ravelled: `args.length`,
     `y0.0.1`."""
     out = []
     for path, leaf in jtu.tree_flatten_with_path(tree)[0]:
