@@ -94,8 +94,7 @@ class _EventsInStep:
         return y, info.success
 
     def _values(self, t: FloatScalar) -> Float[Array, " events"]:
-        """Return the values of the event functions; for a Boolean condition, the time left to the end
-        of the step."""
+        """Return the values of the event functions; for Boolean conditions, the time left in the step."""
         y, _ = self._state(t)
 
         def value(event, after):

@@ -46,8 +46,7 @@ class Replay(eqx.Module):
 
     @staticmethod
     def build(solve: "Solve", saveat: dfx.SaveAt, t: Array, start: State, dense: bool) -> "Replay":
-        """Build the functions; `t` and `start` are examples, `dense` says whether `dense_info` is
-        needed."""
+        """Build the functions; `t` and `start` are examples, `dense` whether `dense_info` is needed."""
         subs = subs_of(saveat)
         interpolates = dense or any(sub.ts is not None for sub in subs)
 

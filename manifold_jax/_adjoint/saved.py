@@ -127,8 +127,8 @@ class SavedValues(eqx.Module):
             gradient, _ = carry
             row = gradient.rows[k]
             t = rows.times[row]
-            # A time at the start of a step is saved at the end of the one before, from which only a
-            # jump separates it.
+            # A time at the start of a step is saved at the end of the one before, unless a jump is
+            # between.
             inside = first | (t > step.start) | ((t == step.start) & step.begins_at_jump)
             return step.accepted & (row >= saving.offset) & inside
 

@@ -45,8 +45,7 @@ class CurveTrace(eqx.Module):
     - `turning_points`: the points between the ends at which `dx[parameter]/ds` changes sign,
         in order, shape `(max_turning_points, k)`, to round-off; unused rows are NaN.
     - `turning_arclengths`: where they are, shape `(max_turning_points,)`, likewise.
-    - `num_turning_points`: how many there are; more than `max_turning_points` if they did not
-        all fit.
+    - `num_turning_points`: how many there are; more than `max_turning_points` if they did not all fit.
     - `result`: `RESULTS.successful`; `RESULTS.nonlinear_divergence` for an `x0` that cannot
         be used, a singular point, or a curve that ends; and the other codes of Diffrax.
     - `stats`: those of [`diffeqsolve`][]; `initial_correction` is how far `x0` was moved.

@@ -24,8 +24,7 @@ from .._solver import Projected
 def kernel(G: Float[Array, "n k"]) -> Float[Array, " k"]:
     """Return the unit vector `tau` with `G tau = 0` and `det [G; tau^T] > 0`, for `k = n + 1`. NaN
     where `G` does not have full rank."""
-    # E G^T = [1; 0], hence G tau = 0 for the last row tau of E; and
-    # E [G^T, tau] = [1, *; 0, |tau|^2].
+    # E G^T = [1; 0], hence G tau = 0 for the last row tau of E; and E [G^T, tau] = [1, *; 0, |tau|^2].
     E, sign = reduction(G.T)
     return sign * E[-1] / jnp.sqrt(jnp.sum(E[-1] ** 2))
 

@@ -99,9 +99,8 @@ def gradient_flow(
     `x' = -P(x) grad f(x)`,  `P = I - G^T (G G^T)^-1 G`,  `G = dg/dx`,
 
     on the manifold from `x0` to a stationary point, then by Newton's method on
-    `grad f + G^T lambda = 0`, `g = 0` to round-off. `f` never increases on the way and every
-    point is feasible, so that (up to the error of the steps) the minimum is the one whose
-    basin `x0` is in.
+    `grad f + G^T lambda = 0`, `g = 0` to round-off. `f` never increases on the way and every point is
+    feasible, so that (up to the error of the steps) the minimum is the one whose basin `x0` is in.
 
     The derivative with respect to `args`, and to everything that `objective` and `constraint` hold
     or close over, is that of the stationary point itself (implicit function), exact in forward and
@@ -139,9 +138,8 @@ def gradient_flow(
     a quasi-Newton method (SciPy's SLSQP, IPOPT) where many variables (thousands) make
     Hessians too large; they may end in another basin, and are not differentiable.
 
-    Source: Sudarsan & Keerthi, Appl. Math. Comput. 92 (1998) 153-193, section 2.2 (d);
-    Tanabe, J. Optim. Theory Appl. 30 (1980) 333-359; Yamashita, Math. Program. 18 (1980)
-    155-168.
+    Source: Sudarsan & Keerthi, Appl. Math. Comput. 92 (1998) 153-193, section 2.2 (d); Tanabe, J.
+    Optim. Theory Appl. 30 (1980) 333-359; Yamashita, Math. Program. 18 (1980) 155-168.
     """
     check_state(x0, "x0")
     x0 = jtu.tree_map(jnp.asarray, x0)
@@ -200,8 +198,7 @@ def _descend(
 ) -> tuple[dfx.Solution, FloatScalar]:
     """Follow the projected gradient; return the typical size of the gradient, too."""
     largest = lambda v: jnp.max(jnp.abs(v))
-    # If `grad f` itself is (nearly) zero at the start, only its rounding errors would be left as the
-    # scale.
+    # If `grad f` is (nearly) zero at the start, only its rounding errors would be left as the scale.
     bend = jnp.max(jnp.sum(jnp.abs(jax.hessian(lagrangian.f)(start)), axis=1))
     rounding = 10 * jnp.finfo(start.dtype).eps * bend * (largest(start) + 1)
     size = jnp.maximum(largest(jax.grad(lagrangian.f)(start)), rounding / tolerance)

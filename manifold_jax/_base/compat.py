@@ -90,8 +90,7 @@ def save_states(state: LoopState) -> list[SaveState]:
 
 
 def with_result(state: LoopState, result: RESULTS) -> LoopState:
-    """Return the state of a solve that ends with this result before its next step, unless it is
-    "successful"."""
+    """Return the state of a solve that ends with this result before its next step, if it is a failure."""
     return eqx.tree_at(lambda s: s.result, state, update_result(state.result, result))
 
 
@@ -177,9 +176,8 @@ class Differentiable(NamedTuple):
 
 
 def scan_counts(equation: Any) -> tuple[int, int]:
-    """Return the numbers of constants and of carried values among the inputs of a traced
-    `lax.scan`. JAX 0.12 has no parameters for them; arrays that are scanned over have one axis less
-    in the body."""
+    """Return the numbers of constants and of carried values among the inputs of a traced `lax.scan`.
+    JAX 0.12 has no parameters for them; scanned arrays have one axis less in the body."""
     body = getattr(equation.params["jaxpr"], "jaxpr", equation.params["jaxpr"])
     scanned = lambda outer, inner: sum(
         a.aval.ndim > b.aval.ndim for a, b in zip(outer, inner, strict=True)

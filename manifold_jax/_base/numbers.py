@@ -63,7 +63,6 @@ def _time_as_array(t: Any) -> Any:
 
 
 def _as_array(number: float | complex) -> Any:
-    """Keep the number under `jax.jit`: it is part of that program anyway, and constants make a
-    better one."""
+    """Keep the number under `jax.jit`: it is part of that program, and constants make a better one."""
     array = jnp.asarray(number)
     return number if isinstance(array, jax.core.Tracer) else array

@@ -152,8 +152,7 @@ class Constraint(AbstractConstraint):
         itself: indices must be NumPy arrays that it closes over, not be in `args`. Sparse equations
         must be independent. [`LocalCoordinates`][] forms dense matrices whatever the structure.
 
-    Use [`Invariants`][] when the constraint is "this quantity keeps its initial
-    value".
+    Use [`Invariants`][] when the constraint is "this quantity keeps its initial value".
     """
 
     function: ResidualFunction

@@ -60,15 +60,14 @@ class FactoredGram(NamedTuple):
 # Redundant equations depend on each other on the manifold. At a distance `d` from it (a scaled
 # residual) their gradients differ from dependent ones by up to this many times `d`, and so do the
 # entries of `G V` of two points that far apart: eigenvalues of `G V` that vanish on the manifold become
-# O(d) of the largest. Those of the Gram matrix `G W^-1 G^T` of a single point are the squares of
-# singular values, hence O(d^2).
+# O(d) of the largest. Those of the Gram matrix `G W^-1 G^T` of one point are squares of singular
+# values, O(d^2).
 _PERTURBATION = 1e3
 
 
 def dependence_threshold(ratio: FloatScalar) -> FloatScalar:
     """Return the fraction of the largest eigenvalue below which others count as zero, where those of
-    dependent equations reach `ratio` of it: above rounding, and at most the default of
-    `pseudo_invert`."""
+    dependent equations reach `ratio` of it: above rounding, and at most the default of `pseudo_invert`."""
     smallest = 1e4 * jnp.finfo(ratio.dtype).eps
     return jax.lax.stop_gradient(jnp.clip(ratio, smallest, DEPENDENCE_THRESHOLD))
 

@@ -55,10 +55,9 @@ def project(
 
     **Raises:**
 
-    `TypeError` or `ValueError` for states or residuals of the wrong type or shape. With `throw=True`
-    a `RuntimeError` (under `jit` too, and for a batch if one of its points fails) that says whether
-    the constraint was not finite, its Jacobian rank deficient, or the equations could not be
-    satisfied.
+    `TypeError` or `ValueError` for states or residuals of the wrong type or shape. With `throw=True` a
+    `RuntimeError` (under `jit` too, and for a batch if one of its points fails) that says whether the
+    constraint was not finite, its Jacobian rank deficient, or the equations could not be satisfied.
 
     [`consistent_state`][] is the same for initial values.
     """

@@ -45,10 +45,9 @@ class NewtonProjection(eqx.Module):
         its own, post-stabilization: one Newton step per step of the solver, successful if it
         lowers the residual; states are then near the manifold (the square of the local error),
         not on it to round-off.
-    - `tolerance`: the largest scaled residual that counts as success. `None` is 50
-        rounding units of the state's type. Where a residual has larger rounding errors than
-        that (large terms that cancel) corrections fail: write it without cancellation, or
-        raise the tolerance.
+    - `tolerance`: the largest scaled residual that counts as success. `None` is 50 rounding units of
+        the state's type. Where a residual has larger rounding errors than that (large terms that
+        cancel) corrections fail: write it without cancellation, or raise the tolerance.
     - `rtol`, `atol`: the tolerances of the step size controller, for `metric="error"`;
         `mj.diffeqsolve` fills them in.
 

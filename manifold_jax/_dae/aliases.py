@@ -56,8 +56,7 @@ class Aliases(NamedTuple):
         return Aliases(root, shift, factor, np.array(used, int))
 
     def merged(self, there: np.ndarray) -> np.ndarray:
-        """Reduce a Boolean array `(equations, derivatives, unknowns)` to the equations and unknowns
-        that are left."""
+        """Reduce a Boolean array `(equations, derivatives, unknowns)` to what is left of both."""
         n, levels = there.shape[1:][::-1]
         out = np.zeros((n, levels + int(self.shift.max(initial=0)), n), bool)
         for k in range(n):
@@ -77,8 +76,7 @@ def _candidates(example: Example, occurrence: Occurrence) -> list[Any]:
 
     @jax.jit
     def sums(t: Any, args: Any) -> Any:
-        """Return sums of the values at zero, of the coefficients of derivatives, and of those of
-        unknowns."""
+        """Return sums of the values at zero, of coefficients of derivatives, and of those of unknowns."""
         at = lambda *jets: example.residual(t, jets, args)
         zero, *higher = zeros = [jnp.zeros_like(x) for x in example.jets]
         values, a = jax.jvp(at, zeros, [zero, *map(jnp.ones_like, higher)])
@@ -109,8 +107,7 @@ def lifted(example: Example, aliases: Aliases, structure: Structure) -> Structur
 
 
 def _nonlinear(example: Example, aliases: Aliases, structure: Structure) -> np.ndarray:
-    """Return which of the leading derivatives occur nonlinearly in equations that are not
-    differentiated."""
+    """Return which leading derivatives occur nonlinearly in equations that are not differentiated."""
     levels = structure.d[aliases.columns] - aliases.shift
     (unknowns,) = np.nonzero((levels >= 0) & (levels <= example.equations.order))
     depends = nonlinear_unknowns(example, levels[unknowns], unknowns)

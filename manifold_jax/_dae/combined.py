@@ -135,8 +135,7 @@ def _common_null_vectors(matrices: list[np.ndarray]) -> list[np.ndarray]:
 
 
 def _jacobians(example: Example, there: np.ndarray) -> list[np.ndarray]:
-    """Return the Jacobians with respect to all derivatives, `(n, levels, n)`, at other times,
-    values and parameters."""
+    """Return all Jacobians `(n, levels, n)` at other times, values and parameters."""
 
     @jax.jit
     def jacobian(t: Array, jets: tuple[Array, ...], args: object) -> Array:

@@ -42,8 +42,7 @@ class Layout(NamedTuple):
         return len(self.names)
 
     def leading_names(self) -> np.ndarray:
-        """Return derivative and unknown for each leading derivative, under the name with the fewest
-        derivatives."""
+        """Return derivative and unknown for each leading derivative, by the name of lowest order."""
         found = []
         for j, root in enumerate(self.aliases.roots.tolist()):
             order = self.structure.d[j] - self.aliases.shift
@@ -75,8 +74,7 @@ class Layout(NamedTuple):
         return np.concatenate([self.scale(), np.ones(len(self.structure.d))])
 
     def jet(self, k: int, further: int = 0) -> Gather:
-        """Return the map to derivative `k` of all unknowns, given `further` derivatives of `w` after
-        it."""
+        """Return the map to derivative `k` of all unknowns, with `further` derivatives of `w` after it."""
         d, j = self.structure.d, self.aliases.columns
         level = k + self.aliases.shift
         inside = level < len(self.places)

@@ -123,8 +123,8 @@ def nearest_state(g: Constrained, guess: Float[Array, " n"]) -> NearestState:
 
 def _polished(equations: SquareSystem, start: Float[Array, " k"]) -> Float[Array, " k"]:
     """Improve a root by Newton's steps as long as each is less than half the one before. A residual at
-    rounding level is not enough: beside terms of size 1, a current of 1e-12 still has only half of its
-    digits there."""
+    rounding level is not enough: beside terms of size 1, a current of 1e-12 has only half of its
+    digits."""
     equations, start = without_derivative((equations, start))
 
     def advance(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:

@@ -26,8 +26,7 @@ class Example(NamedTuple):
 
     @staticmethod
     def of(equations: Equations, x: Array, args: Args) -> "Example":
-        """Take zero derivatives. Floats in `args` are parameters like arrays; integers and all else are
-        constants."""
+        """Take zero derivatives. Floats in `args` are parameters like arrays; all else is constant."""
         is_parameter = lambda leaf: eqx.is_inexact_array_like(leaf) or eqx.is_array(leaf)
         traced, fixed = eqx.partition(args, is_parameter)
         traced = jax.tree_util.tree_map(jnp.asarray, traced)

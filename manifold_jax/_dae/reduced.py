@@ -76,8 +76,7 @@ class Reduced(eqx.Module):
     ) -> Float[Array, " m"]:
         """Return `F_i^(k)` for `first_i <= k < end_i`. They do not depend on the leading derivatives
         `w`, but where these cancel in combinations of equations their size matters: give `w` like those
-        of `z`. Without combinations the example is used, at which everything is finite, with its
-        slopes."""
+        of `z`. Without combinations the example is used, where everything is finite."""
         order = int(end.max(initial=0)) - 1
         if order < 0:
             return jnp.zeros((0,), z.dtype)

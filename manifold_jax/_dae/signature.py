@@ -18,8 +18,8 @@ ABSENT = -(10**6)
 class Structure(NamedTuple):
     """A signature matrix `sigma_ij`, the order of the highest derivative of unknown `j` in equation
     `i`, with the smallest offsets `c_i` (differentiations of equation `i`) and `d_j` (order of the
-    highest derivative of unknown `j` afterwards) such that `d_j - c_i >= sigma_ij`, with equality on
-    the transversal."""
+    highest derivative of unknown `j` afterwards) with `d_j - c_i >= sigma_ij`, and equality on the
+    transversal."""
 
     sigma: np.ndarray
     transversal: np.ndarray  # the unknown that belongs to each equation
@@ -28,8 +28,7 @@ class Structure(NamedTuple):
 
     @property
     def leading(self) -> np.ndarray:
-        """The entries at which the equations, differentiated `c_i` times, contain the derivatives
-        `d_j`."""
+        """The entries where the equations, differentiated `c_i` times, contain the derivatives `d_j`."""
         return self.d[None, :] - self.c[:, None] == self.sigma
 
     @property

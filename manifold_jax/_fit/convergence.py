@@ -28,8 +28,7 @@ def flat(losses: list[float]) -> bool:
 def at_minimum(
     losses: list[float], u: Unknowns, solved: Solved, objective: Objective, solver: Any
 ) -> bool:
-    """Whether steps are rejected at the minimum because the errors of the solves exceed the possible
-    gain."""
+    """Whether steps are rejected because the errors of the solves exceed the possible gain."""
     if not isinstance(solver, optx.AbstractLeastSquaresSolver) or not stalled(losses, _TRIALS):
         return False
     return relative_offset(*stacked(u, solved, objective)) <= _OFFSET

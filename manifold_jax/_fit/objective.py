@@ -150,8 +150,7 @@ def stacked(u: Any, solved: Solved, objective: Objective) -> tuple[np.ndarray, n
 
 
 def residuals(u: Unknowns, objective: Objective) -> tuple[Any, Any]:
-    """Return the residuals for least-squares solvers: of the data and of the joints; then the loss
-    and all pieces."""
+    """Return the residuals of data and joints for least-squares solvers; then the loss and all pieces."""
     solved = solve(u, objective)
     predicted = solved.around(u, objective)
     r = weighted(objective, predicted)
@@ -194,8 +193,7 @@ def _own_loss(objective: Objective, observed: Any, data: Any, weights: Any) -> F
 
 @eqx.filter_custom_vjp
 def _backwards(x: Any, rest: Any) -> Prediction:
-    """Differentiate with respect to many unknowns: one reverse sweep instead of a forward sweep for
-    each."""
+    """Differentiate with respect to many unknowns: one reverse sweep instead of many forward sweeps."""
     piece, simulator = rest
     return simulator.predict(x, piece, StepReplayAdjoint())
 

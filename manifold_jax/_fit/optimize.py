@@ -33,8 +33,7 @@ class Options(NamedTuple):
 
 
 class Outcome(NamedTuple):
-    """The final unknowns, all pieces and the loss there, the loss of each step, and how the optimizer
-    ended."""
+    """The final unknowns, all pieces and the loss there, the loss of each step, and the message."""
 
     u: Any
     solved: Solved

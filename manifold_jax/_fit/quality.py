@@ -107,8 +107,7 @@ def gauss_newton(J: np.ndarray, C: np.ndarray) -> Uncertainty:
 
 
 def _sparse(directions: np.ndarray) -> np.ndarray:
-    """Return another basis, in which each vector has one unknown to itself, by Gauss-Jordan
-    elimination."""
+    """Return another basis, in which each vector has one unknown to itself (Gauss-Jordan elimination)."""
     count = directions.shape[0]
     if count == 0:
         return directions

@@ -16,8 +16,7 @@ from .objective import Objective
 from .optimize import Options
 
 
-# Number of unknowns of one trajectory beyond which one reverse sweep is cheaper than a forward sweep
-# for each.
+# Number of unknowns of a trajectory beyond which one reverse sweep is cheaper than forward sweeps.
 _MANY_UNKNOWNS = 50
 
 

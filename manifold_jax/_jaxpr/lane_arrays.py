@@ -54,8 +54,7 @@ class Lanes:
         self._one = before
 
     def apply(self, primitive: Any, params: dict[str, Any], dtype: Any, *numbers: Number) -> Node:
-        """Return the node of an operation on numbers that are not all constants; equal operations
-        share one."""
+        """Return the node of an operation on numbers that are not all constants; equal ones share it."""
         key = self._key(primitive, params, numbers)
         if key is not None and key in self._known[-1]:
             return self._known[-1][key]

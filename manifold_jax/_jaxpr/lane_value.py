@@ -103,8 +103,7 @@ class Value:
 
 
 def object_array(items: list[Any], shape: tuple[int, ...]) -> np.ndarray:
-    """Return an object array of objects that are arrays themselves, which NumPy would otherwise
-    convert."""
+    """Return an object array of arrays, which NumPy would otherwise convert."""
     out = np.empty(len(items), object)
     for i, item in enumerate(items):
         out[i] = item

@@ -127,9 +127,9 @@ def sources(
 
 
 def arranged_factors(equation: Any, factors: Sequence[np.ndarray]) -> list[np.ndarray]:
-    """Return the factors of a `dot_general` with their axes rearranged: one axis of what both have
-    in common, one of the factor's own, one that is summed over, and trailing ones that arrays of
-    numbers do not have."""
+    """Return the factors of a `dot_general` with their axes rearranged: one that both have in common,
+    one of the factor's own, one that is summed over, and trailing ones that arrays of numbers do not
+    have."""
     out = []
     axes = equation.params["dimension_numbers"]
     for variable, x, summed, batch in zip(equation.invars, factors, *axes, strict=True):

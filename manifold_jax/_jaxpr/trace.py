@@ -12,9 +12,8 @@ from .._base.compat import scan_counts
 
 
 def walk(function: Any, inputs: Sequence[Any], constant: Callable, apply: Callable) -> list[Any]:
-    """Evaluate a jaxpr, with or without its constants, at the values `inputs`, in order.
-    `constant(x)` is the value of a constant; `apply(equation, values)` returns the values of the
-    results of an equation."""
+    """Evaluate a jaxpr, with or without its constants, at the values `inputs`, in order. `constant(x)`
+    is the value of a constant; `apply(equation, values)` returns those of the results of an equation."""
     jaxpr, constants = getattr(function, "jaxpr", function), getattr(function, "consts", ())
     known = dict(zip(jaxpr.constvars, map(constant, constants), strict=True))
     known.update(zip(jaxpr.invars, inputs, strict=True))
@@ -57,9 +56,8 @@ def unrolled_scan(
 
 
 def example(shape: tuple[int, ...], dtype: Any) -> jax.ShapeDtypeStruct:
-    """Return the shape and dtype of an array of one lane. Inside `jax.shard_map` the types of
-    arrays name the mesh, and `eqx.filter_closure_convert` refuses types without it after it has
-    seen one."""
+    """Return the shape and dtype of an array of one lane. Inside `jax.shard_map` the types of arrays
+    name the mesh, and `eqx.filter_closure_convert` refuses types without it after one with it."""
     mesh = jax.sharding.get_abstract_mesh()
     if mesh.empty:
         return jax.ShapeDtypeStruct(shape, dtype)

@@ -19,7 +19,7 @@ class AbstractLieGroup(eqx.Module):
 
     @abc.abstractmethod
     def tangent(self, y: Array, velocity: Float[Array, " d"]) -> Array:
-        r"""Return the velocity $y\,\xi$ of the state, like `y`: for vector fields that are known in the
+        r"""Return the velocity $y\,\xi$ of the state, like `y`: for fields that are known in the
         algebra."""
 
     @abc.abstractmethod

@@ -176,8 +176,7 @@ def find_root(
 
 
 class ImplicitTangent(NamedTuple):
-    """The tangent `dz` of a root, that of the point with the unknowns held fixed, and the linearization
-    at the root."""
+    """Tangents of a root and of its point at fixed unknowns, and the linearization at the root."""
 
     dz: Float[Array, " m"]
     moved: Float[Array, " n"]

@@ -24,8 +24,7 @@ _UNROLLED_COLUMNS = 4
 
 
 class UnrolledElimination(eqx.Module):
-    """`E A = U`, upper triangular, with the inverses of the pivots on its diagonal. `E` includes the
-    row exchanges."""
+    """`E A = U`, upper triangular, with inverse pivots on its diagonal. `E` has the row exchanges."""
 
     U: list[list[FloatScalar]]
     E: Float[Array, "n n"]
@@ -51,8 +50,7 @@ class UnrolledElimination(eqx.Module):
 def factorize_pivoted(
     A: Float[Array, "n n"], largest_written_out: int = LARGEST_WRITTEN_OUT
 ) -> Factorization:
-    """Factor any matrix with row exchanges; a singular or non-finite matrix is replaced by the
-    identity."""
+    """Factor any matrix with row exchanges; one that is singular or not finite becomes the identity."""
     fixed, eye = jax.lax.stop_gradient(A), jnp.eye(A.shape[0], dtype=A.dtype)
     factors, regular = (_eliminate if A.shape[0] <= largest_written_out else _lapack)(fixed)
     return Factorization(jnp.where(regular, A, eye), factors, regular, multiply)

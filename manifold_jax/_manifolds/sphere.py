@@ -48,8 +48,7 @@ class Sphere(mj.AbstractConstraint):
             )
         square, target = _square(y), self.radius**2
         success = jnp.isfinite(square) & (square > 0)
-        # Replaced where it fails before anything is computed with it: the derivative of a NaN is never
-        # zero.
+        # Replaced where it fails before anything is computed: the derivative of a NaN is never zero.
         fallback = jax.lax.stop_gradient(y if fallback is None else fallback)
         x = jtu.tree_map(lambda a, b: jnp.where(success, a, b), y, fallback)
         size = _square(x)

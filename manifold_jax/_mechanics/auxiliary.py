@@ -83,8 +83,7 @@ def split(y: Y) -> tuple[tuple[Y, Y], Y]:
 
 
 def _projections(projection: NewtonProjection, y: Y) -> tuple[NewtonProjection, NewtonProjection]:
-    """Return the projections of the motion and of the auxiliary states, each with its part of the
-    metric."""
+    """Return the projections of motion and auxiliary states, each with its part of the metric."""
     if projection.metric is None or isinstance(projection.metric, str):
         return projection, projection
     if jtu.tree_structure(projection.metric) != jtu.tree_structure(y):

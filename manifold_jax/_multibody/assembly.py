@@ -165,8 +165,8 @@ class Assembly(eqx.Module):
 
     @over_times
     def joint_coordinates(self, y: tuple[Pose, Pose]) -> dict[str, Float[Array, "*t"]]:
-        """Return angles of hinges (from `-pi` to `pi`) and displacements of sliders by name, zero in
-        the drawing."""
+        """Return angles of hinges (`-pi` to `pi`) and displacements of sliders by name, zero in the
+        drawing."""
         frames, found = Frames.of(*y), {}
         for group in self.joints:
             if group.kind in DRIVEN and group.motions is None:

@@ -99,8 +99,7 @@ def _in_bodies(
 
 
 def _ends(bodies: Bodies, thing: Any, name: str) -> tuple[tuple[int, int], bool, tuple[Any, Any]]:
-    """Return the bodies of a joint or a force, whether its points are those of the drawing, and the
-    points."""
+    """Return the bodies of a joint or force, its points, and whether these are those of the drawing."""
     if thing.first == thing.second:
         raise ValueError(
             f"{name} connects {thing.first!r} with itself. Give two bodies, or `mj.multibody.GROUND`."

@@ -137,8 +137,7 @@ def _matrix(inertia: Array) -> Any:
 
 
 class Bodies(eqx.Module):
-    """The arrays of all bodies: masses `(N,)`, moments of inertia `(N,)` or matrices `(N, 3, 3)`, and
-    the drawing."""
+    """The arrays of all bodies: masses `(N,)`, inertias `(N,)` or `(N, 3, 3)`, and the drawing."""
 
     names: tuple[str, ...] = eqx.field(static=True)
     mass: Float[Array, " n"]

@@ -136,8 +136,7 @@ def residuals(groups: tuple[JointGroup, ...], q: Pose) -> tuple[Float[Array, "k 
 
 def jacobian(groups: tuple[JointGroup, ...], q: Pose) -> Float[Array, "r n c"]:
     """Return the derivatives of all equations of joints with respect to the coordinates of the bodies.
-    Each joint depends on two bodies: one derivative for each of their coordinates, for all joints at
-    once."""
+    Each joint depends on two: one derivative for each of their coordinates, for all joints at once."""
     index, rows = _index(groups), with_ground(q.coordinates)
     number, size = rows.shape
     if not groups:

@@ -42,8 +42,7 @@ def rotation_matrix(p: Float[Array, "*n 4"]) -> Float[Array, "*n 3 3"]:
 
 
 def rates_matrix(p: Float[Array, "*n 4"]) -> Float[Array, "*n 3 4"]:
-    """Return `G(p)`: the angular velocity in the frame of the body is `2 G(p) p'`, and
-    `p' = G(p)^T omega / 2`."""
+    """Return `G(p)`: the angular velocity in the body is `2 G(p) p'`, and `p' = G(p)^T omega / 2`."""
     a, b, c, d = p[..., 0], p[..., 1], p[..., 2], p[..., 3]
     rows = [[-b, a, d, -c], [-c, -d, a, b], [-d, c, -b, a]]
     return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
@@ -78,8 +77,7 @@ def compose(R: Float[Array, "*n i j"], S: Float[Array, "*n j k"]) -> Float[Array
 
 
 def inverted(A: Float[Array, "n 3 3"]) -> tuple[Float[Array, "n 3 3"], BoolScalar]:
-    """Return the inverses of symmetric matrices by their cofactors, and whether all are positive
-    definite."""
+    """Return the inverses of symmetric matrices (cofactors), and whether all are positive definite."""
     next, last = np.array([1, 2, 0]), np.array([2, 0, 1])
     part = lambda i, j: A[:, i[:, None], j[None, :]]
     cofactors = part(next, next) * part(last, last) - part(next, last) * part(last, next)

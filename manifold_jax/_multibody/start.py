@@ -124,8 +124,7 @@ class Closing:
         ]
 
     def assembled(self) -> tuple[Pose, Pose]:
-        """Close the joints by Gauss-Newton steps of least norm in the free coordinates; velocities by
-        one step."""
+        """Close the joints by Gauss-Newton steps of least norm in free coordinates; velocities by one."""
         x, w = np.array(self.x), np.array(self.w)
         for _ in range(ITERATIONS):
             phi, _, J = self.known(x)

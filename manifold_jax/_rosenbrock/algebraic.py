@@ -122,8 +122,7 @@ def _null_space(
     M = jnp.where(jnp.all(jnp.isfinite(M)), M, jnp.eye(n, dtype=M.dtype))
     inverse = jnp.linalg.pinv(M, rtol=10 * unit)
     P = jnp.eye(n, dtype=M.dtype) - M @ inverse
-    # Entries that are zero except for rounding would let large differential equations into the
-    # algebraic ones.
+    # Entries at rounding level would let large differential equations into the algebraic ones.
     return inverse, jnp.where(jnp.abs(P) > 100 * unit, P, 0)
 
 

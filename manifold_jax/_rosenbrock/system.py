@@ -78,8 +78,7 @@ class System(NamedTuple):
         return f0, J, T
 
     def at_start(self, x0: Vector) -> tuple[Linearized, Vector]:
-        """Return the equations with their mass matrix at the beginning, and `y'` in the direction of
-        the step."""
+        """Return the equations and the mass matrix at the beginning, and `y'` in the step's direction."""
         direction = time_direction(self.terms)
         at = self.mass.equations(self.y0, self.args).at(self.t0 * direction, x0)  # pyright: ignore
         return at, at.derivative * jnp.asarray(direction, x0.dtype)

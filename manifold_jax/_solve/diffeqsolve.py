@@ -153,8 +153,7 @@ def _as_in_steps(
     consistent: Consistent,
     y0: Y,
 ) -> Any:
-    """Return the solver as it runs: with the tolerances of the controller, and accurate implicit
-    stages."""
+    """Return the solver with the tolerances of the controller, and accurate implicit stages."""
     if isinstance(solver, AbstractManifoldSolver):
         # All interpolated values are corrected, except those with which an event is searched for.
         solver = solver.within(controller, bends_interpolant=event is not None)

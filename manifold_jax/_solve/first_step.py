@@ -13,8 +13,7 @@ from .setup import ProblemData
 
 
 class FirstStep(NamedTuple):
-    """The step size, signed like `t1 - t0`, and the vector field at the start, as `terms.vf` returns
-    it."""
+    """The step size, signed like `t1 - t0`, and the vector field at the start, as of `terms.vf`."""
 
     size: FloatScalar
     field: Any
@@ -48,8 +47,7 @@ def first_step(
     d0 = norm(start)
 
     def trial(velocity: Y) -> tuple[BoolScalar, FloatScalar, FloatScalar]:
-        """Return whether the velocity is too small for an estimate, its size otherwise, and a trial
-        step."""
+        """Return whether the velocity is too small for an estimate, else its size, and a trial step."""
         d1 = norm(velocity)
         small = (d0 < 1e-5) | (d1 < 1e-5)
         d1 = jnp.where(small, 1.0, d1)

@@ -18,8 +18,7 @@ from .setup import ProblemData, Setup
 
 
 # Largest number of outputs that are corrected one by one, in a program that compiles in two thirds of
-# the time; each of 1001 of the pendulum takes 1.2 us more than all at once.
-# `python -m benchmarks.speed.compile_time`.
+# the time; with 1001 of the pendulum each takes 1.2 us more. `python -m benchmarks.speed.compile_time`.
 MOST_ONE_BY_ONE = 128
 
 

@@ -1,5 +1,4 @@
-"""Records of a problem and of the settings of a solve, built once where a function of the library is
-called."""
+"""Records of a problem and of the settings of a solve, built once in each public function."""
 
 from typing import Any, Literal, NamedTuple, TypeAlias
 

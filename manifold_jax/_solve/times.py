@@ -85,7 +85,7 @@ def _attach(t0: Any, fault: BoolScalar, number: Any, messages: list[str]) -> Any
 
 def refusing_missing_times(function: Function) -> Function:
     """Wrap a solve: with `throw` raise an error that names the time at fault, otherwise return the
-    result code `RESULTS.nonfinite_input`. Times that are known while tracing are checked there, at no
+    result code `RESULTS.nonfinite_input`. Times that are known while tracing are checked then, at no
     cost."""
     signature = inspect.signature(function)
 

@@ -70,8 +70,7 @@ class AbstractManifoldSolver(dfx.AbstractWrappedSolver):
     # Whether the error estimate of a step is raised to the size of its correction, which is a lower
     # bound of the local error (Sudarsan & Keerthi 1998, 3.4).
     bounds_error: bool = eqx.field(default=False, kw_only=True)
-    # `(y, w) -> y`, a state near that of the coordinates `w` in which steps are made; None if they are
-    # states.
+    # `(y, w) -> y`, a state near that of the coordinates `w` of steps; None if they are states.
     state_of_coordinates: Callable[[Y, Y], Y] | None = eqx.field(
         default=None, kw_only=True, static=True
     )
@@ -135,8 +134,7 @@ class AbstractManifoldSolver(dfx.AbstractWrappedSolver):
         self, controller: dfx.AbstractStepSizeController, bends_interpolant: bool
     ) -> "AbstractManifoldSolver":
         """Return the solver as `mj.diffeqsolve` runs it: with the tolerances of the step size
-        controller, unless it has its own. Error estimates are raised to corrections if there are
-        tolerances."""
+        controller, unless it has its own. Error estimates are raised to corrections if there are any."""
         tolerances = controller_tolerances(controller)
         projection = self.projection
         if tolerances is not None and projection.rtol is None:

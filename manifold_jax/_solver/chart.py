@@ -145,8 +145,7 @@ class CoordinatePartitionChart(AbstractChart):
     Prefer [`TangentSpaceChart`][]: partitions need more steps and amplify errors where the
     dependence is ill-conditioned.
 
-    Source: Wehage & Haug, J. Mech. Design 104 (1982) 247-255 (generalized coordinate
-    partitioning).
+    Source: Wehage & Haug, J. Mech. Design 104 (1982) 247-255 (generalized coordinate partitioning).
     """
 
     def at(self, constraint, projection, t, y, args) -> AbstractCoordinates:

@@ -24,16 +24,14 @@ class LocalCoordinates(AbstractManifoldSolver):
     """Any one-step solver in local coordinates: every *stage* is on the manifold, not only
     every step (the paper's parameterization approach).
 
-    At the beginning of each step a chart `x = lift(w)` is set up, `w' = f(t, lift(w))` is
-    advanced by one step of the wrapped solver, and the result lifted. The order of the
-    wrapped solver is kept. Its error estimate is pushed forward to the state, so that the
-    tolerances mean the same as for the other approaches. A stage that has no point on the
-    manifold near it rejects the step.
+    At the beginning of each step a chart `x = lift(w)` is set up, `w' = f(t, lift(w))` is advanced by
+    one step of the wrapped solver, and the result lifted. The order of the wrapped solver is kept. Its
+    error estimate is pushed forward to the state, so that the tolerances mean the same as for the other
+    approaches. A stage that has no point on the manifold near it rejects the step.
 
     **Arguments:**
 
-    - `solver`, `constraint`, `projection`: as for [`Projected`][]; the equations must be
-        independent.
+    - `solver`, `constraint`, `projection`: as for [`Projected`][]; the equations must be independent.
     - `chart`: [`TangentSpaceChart`][] (default) or [`CoordinatePartitionChart`][].
 
     **Raises:**

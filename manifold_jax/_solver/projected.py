@@ -23,9 +23,8 @@ class Projected(AbstractManifoldSolver):
     if no smaller one is possible (constant steps, or steps at the limit of the time's
     precision) the solve ends with `RESULTS.nonlinear_divergence`.
 
-    Works with `diffrax.diffeqsolve`, where every *step* ends on the manifold; use
-    [`mj.diffeqsolve`][] to have the initial value, every saved value, events and the dense
-    solution there too.
+    Works with `diffrax.diffeqsolve`, where every *step* ends on the manifold; use [`mj.diffeqsolve`][]
+    to have the initial value, every saved value, events and the dense solution there too.
 
     **Arguments:**
 
@@ -36,9 +35,8 @@ class Projected(AbstractManifoldSolver):
 
     **Raises:**
 
-    `ValueError` for solvers that carry past values of `y` (leapfrog, reversible) and for
-    Ito solvers of stochastic equations: projection makes them converge to the Stratonovich
-    solution.
+    `ValueError` for solvers that carry past values of `y` (leapfrog, reversible) and for Ito solvers of
+    stochastic equations: projection makes them converge to the Stratonovich solution.
 
     Projection guarantees the constraint, not a smaller error: usually the error shrinks,
     sometimes it grows (compare with `manifold-jax compare`).

@@ -76,8 +76,7 @@ class AbstractStabilization(eqx.Module):
 
     @property
     def ends_on_manifold(self) -> bool:
-        """Whether every step is to end on the manifold, with everything that is returned. Known while
-        tracing."""
+        """Whether every step ends on the manifold, with all that is returned. Known while tracing."""
         return False
 
     @abc.abstractmethod
@@ -111,10 +110,9 @@ class InvariantStabilization(AbstractStabilization):
         this is the projected vector field, for which `g` keeps its value: neutral, violations
         drift linearly with the errors of the solver.
 
-    One Jacobian per evaluation of the field, no iteration. `gain * h` must stay within the
-    stability interval of the solver on the negative real axis (Euler 2, Tsit5 3.5, Dopri5
-    3.3); a step beyond it is rejected, or fails if steps are constant. Large gains make the
-    problem stiff.
+    One Jacobian per evaluation of the field, no iteration. `gain * h` must stay within the stability
+    interval of the solver on the negative real axis (Euler 2, Tsit5 3.5, Dopri5 3.3); a step beyond it
+    is rejected, or fails if steps are constant. Large gains make the problem stiff.
 
     Source: Ascher, Chin & Reich, Numer. Math. 67 (1994) 131-149 (stabilization of invariants).
     """
@@ -132,8 +130,7 @@ class InvariantStabilization(AbstractStabilization):
     def field(self, f, constraint, projection, sign, t, y, args):
         derivative = f(t, y, args)
         w, unravel = jfu.ravel_pytree(derivative)
-        # For the whole state, whatever the structure of the constraint: components are not corrected
-        # separately.
+        # For the whole state, whatever the constraint: components are not corrected separately.
         equations = _equations(constraint, t, y, args, projection)
         x, t = equations.x, equations.t
         factored = equations.factored()
@@ -184,8 +181,7 @@ class ExactStabilization(AbstractStabilization):
         root = solve_correction(equations, jax.lax.stop_gradient(x), projection, False)
         if not self.ends_on_manifold:
             # Corrected again along the normals at that point, which gives the nearest point to one
-            # order higher. Otherwise the change of the distance would have an error of the size of its
-            # square.
+            # order higher. Otherwise the change of the distance would have an error of its square.
             normals = equations.starting_at(root.p).normals()
             again = equations.along(normals.directions)
             root = solve_correction(again, jax.lax.stop_gradient(x), projection, False)

@@ -29,16 +29,14 @@ class Stabilized(AbstractManifoldSolver):
     **Arguments:**
 
     - `solver`, `constraint`: as for [`Projected`][]; ordinary differential equations only.
-    - `stabilization`: [`InvariantStabilization`][] or [`ExactStabilization`][].
-        [`Baumgarte`][] and [`VelocityStabilization`][] change the
-        accelerations of a [`MechanicalSystem`][] instead.
+    - `stabilization`: [`InvariantStabilization`][] or [`ExactStabilization`][]. [`Baumgarte`][] and
+        [`VelocityStabilization`][] change the accelerations of a [`MechanicalSystem`][] instead.
     - `projection`: metric of the correction, [`NewtonProjection`][].
 
     **Raises:**
 
-    As [`Projected`][]. A step with `gain * h` beyond the stability interval of an explicit
-    solver is rejected, or ends the solve with `RESULTS.nonlinear_divergence` if steps are
-    constant.
+    As [`Projected`][]. A step with `gain * h` beyond the stability interval of an explicit solver is
+    rejected, or ends the solve with `RESULTS.nonlinear_divergence` if steps are constant.
 
     Source: Sudarsan & Keerthi (1998), section 3.3; Ascher, Chin & Reich, Numer. Math. 67
     (1994) 131-149.

@@ -128,8 +128,7 @@ class Problem(eqx.Module):
 
         **Arguments:**
 
-        - `t`: one time, or times of shape `(times,)`. Where
-            `reference_at_end_only`, `t1` alone.
+        - `t`: one time, or times of shape `(times,)`. Where `reference_at_end_only`, `t1` alone.
 
         **Returns:**
 

@@ -77,8 +77,7 @@ def allowed(rods: Rods, q: np.ndarray, v: np.ndarray) -> np.ndarray:
 def rod_field(
     rods: Rods, force: Force, dimensions: int
 ) -> Callable[[float, np.ndarray], np.ndarray]:
-    """Return `x' = field(t, x)` for positions and velocities, one after the other, under forces
-    `force(q)`."""
+    """Return `x' = field(t, x)` for `x` of positions and velocities, under forces `force(q)`."""
     shape = rods.inverse_masses.size, dimensions
 
     def field(_: float, x: np.ndarray) -> np.ndarray:

@@ -20,8 +20,7 @@ _CORNERS = np.array([0, 0, -1, -1]), np.array([0, -1, 0, -1])
 
 class CableNetArgs(NamedTuple):
     """Parameters of `cable_net`: mass of every knot (kg), length of every cable between two of them
-    (m), the distance of neighbouring knots in plan at the start over that length, and gravity
-    (m/s^2)."""
+    (m), the distance of neighbouring knots in plan at the start over that length, and gravity (m/s^2)."""
 
     mass: Any
     length: Any

@@ -65,8 +65,7 @@ def assembly(args: DeltaRobotArgs) -> Assembly:
 
 
 def _initial_state(args: DeltaRobotArgs, start: State) -> State:
-    """Return the state for position and velocity of the platform in `start`, with the lengths of
-    `args`."""
+    """Return the state for the platform's motion in `start`, with the lengths of `args`."""
     q, v = start
     angle, rate, _ = _arms(jnp, q.position[3], v.position[3], args)
     return _bodies(jnp, q.position[3], v.position[3], angle, rate, args)

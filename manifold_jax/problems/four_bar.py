@@ -33,8 +33,7 @@ def _mass(q: Vector, args: FourBarArgs) -> Vector:
 
 
 def _joints(t: RealScalarLike, q: Vector, args: FourBarArgs) -> Float[Array, "4 2"]:
-    """Return the gaps of the joints: pivot of the crank, crank to coupler, coupler to rocker, pivot of
-    the rocker."""
+    """Return the gaps at the pivot of the crank, the ends of the coupler, and the pivot of the rocker."""
     x, y, angle = q[0::3], q[1::3], q[2::3]
     centers = jnp.stack([x, y], axis=1)
     halves = jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=1) * (0.5 * args.lengths[:3, None])
@@ -108,8 +107,7 @@ def _exact(t: np.ndarray, args: FourBarArgs, y0: Any) -> tuple[np.ndarray, np.nd
 
 
 def _crank_equation(args: FourBarArgs) -> Callable[[float, np.ndarray], tuple[float, ...]]:
-    """Return the equation of the three angles and the rate of the crank; lists of floats, which
-    are fast."""
+    """Return the equation of the three angles and the rate of the crank, on lists of floats (fast)."""
     a, b, c, _ = args.lengths.tolist()
     m1, m2, m3 = args.masses.tolist()
     g = float(args.gravity)
@@ -165,10 +163,9 @@ def four_bar(
 
     **Arguments:**
 
-    - `masses` (kg) of crank, coupler and rocker, shape `(3,)`, `lengths` (m) of crank, coupler,
-        rocker and ground, shape `(4,)`, `gravity` (m/s^2): `args`. `with_args` keeps the
-        crank's angle and rate and the way the loop is closed, also those of an initial state
-        of yours.
+    - `masses` (kg) of crank, coupler and rocker, shape `(3,)`, `lengths` (m) of crank, coupler, rocker
+        and ground, shape `(4,)`, `gravity` (m/s^2): `args`. `with_args` keeps the crank's angle and
+        rate and the way the loop is closed, also those of an initial state of yours.
     - `crank_angle`, `crank_rate`: at `t = 0` (radian, radian/s), with the coupler and the
         rocker above the line from the crank's end to the rocker's pivot.
     - `t1`: the end of the time span (s).

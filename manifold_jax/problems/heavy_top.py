@@ -42,9 +42,8 @@ BENCHMARK_QUATERNION = (
 
 
 class HeavyTopArgs(NamedTuple):
-    """Parameters of `heavy_top`: mass (kg), principal moments of inertia about the fixed point
-    (kg m^2), shape `(3,)`, centre of mass in the frame of the body (m), shape `(3,)`, and
-    gravity (m/s^2)."""
+    """Parameters of `heavy_top`: mass (kg), principal moments of inertia about the fixed point (kg
+    m^2), shape `(3,)`, centre of mass in the frame of the body (m), shape `(3,)`, and gravity (m/s^2)."""
 
     mass: Any
     inertia: Any
@@ -69,8 +68,7 @@ def _weight(q: Vector, args: HeavyTopArgs) -> FloatScalar:
 
 
 def _force(t: RealScalarLike, q: Vector, v: Vector, args: HeavyTopArgs) -> Vector:
-    """Return the force of the Lagrangian `(2 G(q) v).I (2 G(q) v) / 2 - V(q)`, with `G(q) v =
-    -G(v) q`."""
+    """Return the force of the Lagrangian `(2 G(q) v).I (2 G(q) v) / 2 - V(q)`, with `G(q) v = -G(v) q`."""
     gyroscopic = -8 * rates_matrix(v).T @ (args.inertia * (rates_matrix(q) @ v))
     return gyroscopic - jax.grad(_weight)(q, args)
 
@@ -137,10 +135,9 @@ def heavy_top(
     The standard problem is a symmetric (Lagrange) top, released with its axis 0.6 radian from
     the vertical: it nutates between two heights, with cusps, while it precesses.
 
-    The solution is an independent integration (SciPy's DOP853) of Euler's equations with
-    the kinematics of the quaternion, for all moments of inertia and from every initial state on
-    the manifold; to about 1e-12 in the standard problem. Its height agrees with the elliptic
-    function that it is.
+    The solution is an independent integration (SciPy's DOP853) of Euler's equations with the kinematics
+    of the quaternion, for all moments of inertia and from every initial state on the manifold; to about
+    1e-12 in the standard problem. Its height agrees with the elliptic function that it is.
 
     The benchmark of the literature is `heavy_top(**BENCHMARK)`, a top that spins at 150 rad/s,
     with 5 published digits at the end

@@ -105,8 +105,7 @@ def parallelogram(
     five are independent (`redundant=True`): without the third crank the motion would be
     the same, and how the load is shared between the cranks is not determined.
 
-    The state is `(q, v)`, each of shape `(6,)`; twelve constraints, of which ten are
-    independent.
+    The state is `(q, v)`, each of shape `(6,)`; twelve constraints, of which ten are independent.
 
     Exact solution by Jacobi elliptic functions: the coupler does not tilt, and the cranks
     swing like one pendulum of length $L (M + m) / (M + 3 m / 2)$. It holds for swings that

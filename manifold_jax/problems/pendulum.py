@@ -136,9 +136,8 @@ def pendulum(
     - IFToMM benchmark A01: `pendulum(q0=(-1.0, 0.0))`; its curve, 6 digits, is in this
         module (`from manifold_jax.problems.pendulum import A01_X, A01_Y`). The text of the
         benchmark starts at `x = +1` in one place, its data at `x = -1`: mirror images.
-    - IVP test set: `pendulum(gravity=1.0, v0=(0.0, 1.0), t1=1.0)`. Of the 18 printed
-        digits of the end values only 11 are right (`reference` does not use them). Its
-        multiplier is twice $\lambda$.
+    - IVP test set: `pendulum(gravity=1.0, v0=(0.0, 1.0), t1=1.0)`. Of the 18 printed digits of the end
+        values only 11 are right (`reference` does not use them). Its multiplier is twice $\lambda$.
 
     A known trap: the gravity with which a pendulum released from the horizontal returns
     after 2 s is `4 K(1/2)^2 = 13.750371636040745`; the value 13.7503716373294544 that is
@@ -219,9 +218,8 @@ def spherical_pendulum(
 
     **Arguments:**
 
-    - `gravity` (m/s^2), `length` (m), `mass` (kg): scalars, `args`. `with_args` moves the
-        initial position, also one of yours, along its ray to the new length and keeps the
-        velocity.
+    - `gravity` (m/s^2), `length` (m), `mass` (kg): scalars, `args`. `with_args` moves the initial
+        position, also one of yours, along its ray to the new length and keeps the velocity.
     - `t1`: the end of the time span (s).
 
     Source: Whittaker, A Treatise on the Analytical Dynamics of Particles and Rigid Bodies

@@ -57,8 +57,7 @@ def energy(y: Any, args: PolymerArgs) -> Any:
 
 
 def _initial_state(args: PolymerArgs, start: State) -> State:
-    """Return the state for the directions of the bonds and their rates of turning, with the lengths of
-    `args`."""
+    """Return the state for directions of bonds and their rates in `start`, with the lengths of `args`."""
     d, rate = jnp.diff(start[0], axis=0), jnp.diff(start[1], axis=0)
     stretch = (args.lengths / jnp.sqrt(jnp.sum(d * d, axis=1)))[:, None]
     ends = lambda first, links: jnp.cumsum(jnp.concatenate([first[:1], stretch * links]), axis=0)

@@ -16,8 +16,7 @@ State: TypeAlias = tuple[Pose, Pose]
 
 CYLINDERS = tuple(f"cylinder {i}" for i in range(1, 7))
 PISTONS = tuple(f"piston {i}" for i in range(1, 7))
-# Angles of the joints at base and platform, seen from above: pairs, at the platform turned by 60
-# degrees.
+# Angles of the joints, seen from above, in pairs; those of the platform are turned by 60 degrees.
 AT_BASE = tuple(math.radians(120 * (i // 2) + (-15, 15)[i % 2]) for i in range(6))
 AT_PLATFORM = tuple(math.radians(120 * (i // 2) + (-45, 45)[i % 2]) for i in range(6))
 # Centres of mass of cylinders and pistons from their ends, and their moments of inertia across
@@ -41,8 +40,7 @@ class StewartPlatformArgs(NamedTuple):
 
 
 def _points(xp: Any, args: Any) -> tuple[Any, Any, Any]:
-    """Return joints at the base, joints in the platform's frame, and the first axes of the universal
-    joints."""
+    """Return joints at base and platform, and the first axes of the universal joints."""
     dtype = args.base_radius.dtype
     circle = lambda angles: xp.asarray(
         np.stack([np.cos(angles), np.sin(angles), np.zeros(6)], axis=1), dtype
@@ -186,8 +184,7 @@ def _twist_equation(args: StewartPlatformArgs) -> Any:
     disc = np.array([0.25, 0.25, 0.5]) * args.platform_mass * size**2
 
     def velocities(x, R, u, w):
-        """Return the velocities of centres of mass and of turning, `(..., 13, 3)`, for twists
-        `(..., 3)`."""
+        """Return velocities of centres of mass and of turning, `(..., 13, 3)`, for twists `(..., 3)`."""
         _, moving, _, turning, spins = _leg_motion(np, points, x, R, u, w)
         c = CENTER * size
         linear = np.concatenate([u[..., None, :], c * turning, moving - c * turning], axis=-2)
@@ -255,10 +252,9 @@ def stewart_platform(
 
     **Arguments:**
 
-    - `base_radius`, `platform_radius`, `height` of the platform in the drawing (m),
-        `platform_mass`, `leg_mass` of each cylinder and piston (kg), `stiffness` (N/m) and
-        `rest_length` (m) of the legs, `gravity` (m/s^2): `args`. `with_args` keeps pose and
-        velocities of the platform.
+    - `base_radius`, `platform_radius`, `height` of the platform in the drawing (m), `platform_mass`,
+        `leg_mass` of each cylinder and piston (kg), `stiffness` (N/m) and `rest_length` (m) of the
+        legs, `gravity` (m/s^2): `args`. `with_args` keeps pose and velocities of the platform.
     - `velocity` (m/s) and `spin` (rad/s, in space) of the platform at `t = 0`, shape `(3,)`.
     - `t1`: the end of the time span (s).
 

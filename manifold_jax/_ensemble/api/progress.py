@@ -6,8 +6,7 @@ from ..._base.extras import NoBar, print_line, terminal_bar
 
 
 class Meter:
-    """A progress meter, silent unless `shown`. Lines are at least a second and a tenth of the elapsed
-    time apart."""
+    """Silent unless `shown`. Lines are at least a second and a tenth of the elapsed time apart."""
 
     def __init__(self, size: int, finished: int, failed: int, shown: bool):
         self.size = size

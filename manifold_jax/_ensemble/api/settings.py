@@ -40,8 +40,7 @@ def _described(value: Any) -> Any:
 
 
 def _fingerprint(program: str, inputs: Any) -> str:
-    """Return a fingerprint of a program and of the arrays it is called with, those in functions
-    included."""
+    """Return a fingerprint of a program and of its input arrays, those in functions included."""
     digest = hashlib.sha256(program.encode())
     for leaf in jtu.tree_leaves(eqx.filter(inputs, eqx.is_array)):
         digest.update(np.asarray(leaf).tobytes())

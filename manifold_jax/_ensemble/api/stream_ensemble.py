@@ -169,8 +169,7 @@ def _compute(stored: StoredEnsemble, lowered: Any, call: Callable, progress: boo
 def _solve_chunk(
     given: dict[str, Any], key: Array, start: Array, size: int, chunk: int
 ) -> dict[str, Any]:
-    """Solve a chunk. All chunks share one program: the last one is filled up with copies of the last
-    trajectory."""
+    """Solve a chunk, filled up with copies of the last trajectory: all chunks share one program."""
     index = jnp.minimum(start + jnp.arange(chunk), size - 1)
     samples = drawn(given["sample"], given["t0"], given["t1"], key, index)
     options = {name: x for name, x in given.items() if name != "sample"} | samples

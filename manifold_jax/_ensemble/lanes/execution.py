@@ -20,8 +20,7 @@ from .solution import EnsembleSolution
 
 
 # Largest number of unknowns for which the elimination of a Rosenbrock method is written out in lanes:
-# five (eight) take 0.1 (0.17) of the time of `vmap`, jaxlib 0.12.0.1. Beyond it compiling takes too
-# long.
+# five (eight) take 0.1 (0.17) of the time of `vmap`, jaxlib 0.12.0.1. More take too long to compile.
 LARGEST_STIFF = 8
 
 

@@ -28,16 +28,14 @@ from .schedule import Run, Schedule
 from .solution import EnsembleSolution
 
 
-# Largest number of differentiated numbers that all trajectories have in common; each has a sum in every
-# lane.
+# Largest number of differentiated numbers that are common to all; each has a sum in every lane.
 _MOST_IN_COMMON = 200
 
 
 def gradient_in_lanes(
     inputs: Inputs, differentiated: Any, run: Run, bar: Any, limit: int
 ) -> Inputs:
-    """Return the gradient from `bar`, the cotangents of times and values. `differentiated` is a tree of
-    Booleans."""
+    """Return the gradient from `bar`, the cotangents of times and values."""
     parts = Parts.of(inputs, differentiated)
     if sum(x.size for x in jtu.tree_leaves(parts.common)) > _MOST_IN_COMMON:
         raise NotScalarError("too many numbers in common")

@@ -55,6 +55,5 @@ def gradient_of_mapped(inputs: Inputs, differentiated: Any, bar: Any) -> Any:
 
 
 def tangents_of_mapped(inputs: Inputs, tangents: Any) -> Any:
-    """Return the tangents of times and values. `tangents` of the inputs are `None` where there are
-    none."""
+    """Return the tangents of times and values; those of the inputs are `None` where there are none."""
     return eqx.filter_jvp(_times_and_values, (inputs,), (tangents,))[1]

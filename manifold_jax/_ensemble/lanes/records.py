@@ -32,8 +32,7 @@ class Group(NamedTuple):
 
 
 class InputBars(NamedTuple):
-    """Cotangents of what is differentiated: of what each trajectory has of its own, and of what all
-    have in common."""
+    """Cotangents of the differentiated inputs: of each trajectory, and common to all."""
 
     each: Any
     common: Any

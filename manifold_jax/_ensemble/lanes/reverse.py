@@ -207,8 +207,7 @@ class ReverseSweep:
 
     def _step(self, given: Any, start: Any, end: Any, state: State) -> tuple[Any, Callable]:
         """Return the data of the interpolation in a step, and its pullback: from the cotangents of the
-        smooth part of the state after it and of these data to those of `each`, `common` and
-        `state`."""
+        smooth part of the state after it and of these data to those of `each`, `common`, `state`."""
         each, common, rest = given
         smooth, discrete = eqx.partition(state, eqx.is_inexact_array)
         value = self.parts.smooth(step, rest, discrete, self.solver_state, start, end)
@@ -264,8 +263,7 @@ class ReverseSweep:
     def _transposed(
         self, function: Callable, group: Group, x: Any, bar: Any, *args: Any
     ) -> tuple[InputBars, Any]:
-        """Cotangents of the inputs and of `x`, from that of what a function returns (see
-        `functions.py`)."""
+        """Return the cotangents of the inputs and of `x`, for a function of `functions.py`."""
 
         def transposed(given: Any, x: Any, bar: Any, *args: Any) -> tuple[InputBars, Any]:
             each, common, rest = given

@@ -19,8 +19,7 @@ def saved_rows(
     sub: dfx.SubSaveAt, batch: Batch, rows: Array, t1: Array, first: Y, last: Y, values: Any
 ) -> tuple[Array, Any]:
     """Return times and values, with the trajectories in front: at the start, where states are `first`;
-    at given times, of which each has reached the first `rows`; at the end, at `t1`, where they are
-    `last`."""
+    at given times, of which each has reached the first `rows`; at the end `t1`, where they are `last`."""
     saved = lambda t, y, each: sub.fn(t, y, batch.complete(each).args)
     at = lambda t, y: jax.vmap(saved)(t, y, batch.each)
     t0 = jax.vmap(lambda each: batch.complete(each).t0)(batch.each)

@@ -170,9 +170,8 @@ class Schedule:
             return lane._replace(state=where(active, after, lane.state)), states
 
     def _save(self, lane: Lane, states: Stacked, tried: Any, active: Array) -> tuple[Lane, Stacked]:
-        """Save the interpolated states at the times in this step. The expensive part, their correction,
-        is left for later: here it would be done for all lanes whenever one of them has something to
-        save."""
+        """Save the interpolated states at the times in this step. Their correction is expensive and
+        left for later: here it would be done for all lanes whenever one of them has something to save."""
         kept = active & self._column(tried.kept)
         end, start = self._column(tried.end), self._column(tried.start)
         info = Columns.of_values(tried.dense_info, self.lanes)

@@ -56,8 +56,7 @@ class Start(NamedTuple):
 
 
 class Attempt(NamedTuple):
-    """The result of a step: the trajectory after it, whether it was kept, its times and its
-    interpolation."""
+    """The result of a step: the trajectory after it, whether it was kept, and its interpolation."""
 
     trajectory: Trajectory
     kept: BoolScalar
@@ -161,8 +160,7 @@ class Equations(eqx.Module):
         return self.solver.interpolation_cls(t0=start, t1=end, **dense_info).evaluate(t)
 
     def saved_value(self, given: Given, t: FloatScalar, y: Y) -> tuple[Any, BoolScalar]:
-        """Return the saved value of such a state, and whether it is on the manifold. `t` is the true
-        time."""
+        """Return the saved value of such a state, and whether it is on the manifold, at the true time."""
         success = jnp.asarray(True)
         if self.solver.corrects_output:
             y, info = self.solver.correct(t, y, given.args)

@@ -125,8 +125,7 @@ def _fill_value(name: str, dtype: Any) -> Any:
 
 @contextlib.contextmanager
 def clear_write_errors(path: Path) -> Iterator[None]:
-    """Convert errors of a full disk or of a folder without permission into messages that say what to
-    do."""
+    """Convert errors of a full disk or a folder without permission into messages with advice."""
     try:
         yield
     except OSError as error:

@@ -66,8 +66,7 @@ class StoredEnsemble:
         return sum(self.chunk - max(0, end - self.size) for end in ends)
 
     def faults(self) -> list[Fault]:
-        """Return the files that are missing or damaged, reading all of them; `str` of a fault describes
-        it."""
+        """Return the files that are missing or damaged, reading all; `str` of a fault describes it."""
         path = Path(self.group.store.root)
         return faults_of_descriptions(path, dict(self.group.attrs)) or faults_of_chunks(self.group)
 

@@ -81,8 +81,7 @@ class InOneLoop(eqx.Module):
 
 
 class InChunks(eqx.Module):
-    """Elimination of `c` chunks of `k + 1` blocks, all at the same time: `k` inner ones and a last one.
-    See `of`."""
+    """Elimination of `c` chunks of `k + 1` blocks, all at the same time. See `of`."""
 
     pivots: Pivot  # of the inner blocks; `lower` and `upper` as in `InOneLoop`
     lower: Float[Array, "k c w w"]

@@ -50,8 +50,7 @@ class Structure:
         return per_block, shape, depends.indptr.tobytes(), depends.indices.tobytes()
 
     def __eq__(self, other: object) -> bool:
-        """Compare by contents: a structure that is found again is the same static field, and compiles
-        nothing anew."""
+        """Compare by contents: a structure that is found again is the same static field."""
         return isinstance(other, Structure) and self._contents == other._contents
 
     def __hash__(self) -> int:

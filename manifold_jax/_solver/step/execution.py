@@ -36,8 +36,7 @@ class Step(NamedTuple):
 
 
 class AbstractExecution(eqx.Module):
-    """An execution of steps. `memory` is carried from step to step, arrays of the same shapes in all of
-    them."""
+    """An execution of steps; `memory` is carried from step to step, arrays of constant shapes."""
 
     solver: eqx.AbstractVar[dfx.AbstractSolver]
 
@@ -126,8 +125,8 @@ class OwnStep(AbstractExecution):
 
     def step(self, terms, frame, t0, t1, y0, args, memory, made_jump) -> Step:
         # The memory of a solver belongs to the uncorrected state. Diffrax evaluates it again if any
-        # lane of a batch needs it, so keeping it would make the lanes depend on each other; evaluating
-        # it always does not.
+        # lane of a batch needs it, which would make lanes depend on each other; always evaluating it
+        # does not.
         w1, error, dense_info, memory, result = self.solver.step(
             frame.terms, t0, t1, frame.origin, args, memory, made_jump=True
         )

@@ -1,9 +1,8 @@
 """One explicit Runge-Kutta step, written out stage by stage or in a loop over the stages.
 
-Diffrax runs the stages in a loop with dynamic buffers. Writing them out lets XLA fuse a
-whole step of a small system, and lets the new state be corrected *before* the last stage
-is evaluated there, so that the derivative that a first-same-as-last method carries over
-belongs to the corrected state at no cost.
+Diffrax runs the stages in a loop with dynamic buffers. Writing them out lets XLA fuse a whole step of a
+small system, and lets the new state be corrected *before* the last stage is evaluated there, so that
+the derivative that a first-same-as-last method carries over belongs to the corrected state at no cost.
 """
 
 from collections.abc import Callable
@@ -24,10 +23,9 @@ from .frame import StepFrame
 
 
 # Largest number of equations of the vector field times stages for which stages are written out. With up
-# to 210 (rigid body) a loop over the stages takes 1.1 to 1.3 times as long as written out ones, and 1.7
-# to 2.7 times in a batch; from 1278 (double pendulum) 0.65 to 0.9 times, and 1830 equations
-# (slider-crank) compile in 0.8 of the time. jaxlib 0.10.2 and 0.12.0.1,
-# `python -m benchmarks.speed.thresholds`.
+# to 210 (rigid body) a loop over the stages takes 1.1 to 1.3 times as long, and 1.7 to 2.7 times in a
+# batch; from 1278 (double pendulum) 0.65 to 0.9 times, and 1830 equations (slider-crank) compile in 0.8
+# of the time. jaxlib 0.10.2 and 0.12.0.1, `python -m benchmarks.speed.thresholds`.
 LARGEST_UNROLLED = 500
 
 
@@ -52,9 +50,8 @@ def is_first_same_as_last(tableau: dfx.ButcherTableau) -> bool:
 
 
 class ExplicitStep(NamedTuple):
-    """The state at the end, the coordinates there, the embedded error estimate of the coordinates, the
-    data of the solver's own interpolation, the vector field of the last stage, and the report of the
-    correction."""
+    """The state at the end, the coordinates there and their embedded error estimate, the data of the
+    solver's own interpolation, the vector field of the last stage, and the report of the correction."""
 
     y1: Y
     w1: Y

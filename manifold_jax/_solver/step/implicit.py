@@ -87,8 +87,7 @@ class StageChord(optx.AbstractRootFinder):
 
 
 def with_accurate_stages(solver: dfx.AbstractSolver) -> dfx.AbstractSolver:
-    """Return the solver with its implicit stages solved to round-off, unless the user chose a root
-    finder."""
+    """Return the solver with implicit stages solved to round-off, unless the user chose a root finder."""
     if isinstance(getattr(solver, "root_finder", None), dfx.VeryChord):
         return eqx.tree_at(lambda s: s.root_finder, solver, replace_fn=StageChord)  # pyright: ignore[reportArgumentType]
     return solver
@@ -97,9 +96,8 @@ def with_accurate_stages(solver: dfx.AbstractSolver) -> dfx.AbstractSolver:
 def with_tolerances_of_stages(
     solver: Any, controller: dfx.AbstractStepSizeController, y0: Y
 ) -> Any:
-    """Return a solver whose stages have tolerances. With constant steps there are none that stages
-    could inherit. They are solved to round-off in any case, and count as solved if half of the digits
-    are right."""
+    """Return a solver whose stages have tolerances. With constant steps there are none to inherit.
+    Stages are solved to round-off in any case, and count as solved if half of the digits are right."""
     if isinstance(controller, dfx.AbstractAdaptiveStepSizeController):
         return solver
     finder, names = getattr(solver, "root_finder", None), ("rtol", "atol", "norm")

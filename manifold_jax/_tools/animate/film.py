@@ -81,8 +81,7 @@ def _draw(ax: Axes, take: Take) -> tuple[list[Any], Any]:
 
 
 def _set_limits(ax: Axes, takes: Sequence[Take]) -> None:
-    """Set limits that show both, but nothing farther than the size of the mechanism from the projected
-    one."""
+    """Show both, but nothing farther than the size of the mechanism from the projected one."""
     lower, upper = _extent(takes[-1].lines)
     room = max(upper - lower) * np.array([[1.0], [-1.0]]) * [0.5, 0.5]
     seen = np.array([_extent(take.lines) for take in takes])

@@ -137,8 +137,7 @@ class Case:
         return _weighted_sum(end), end, residual
 
     def exact_gradient(self) -> np.ndarray | None:
-        """Return the gradient of the exact solution, by its finite differences; `None` if it is not
-        known."""
+        """Return the gradient of the exact solution, by differences; `None` if it is not known."""
 
         def value(theta: np.ndarray) -> float:
             y = self.problem_at(jnp.asarray(theta)).reference(self.t1)

@@ -81,8 +81,7 @@ def check_name(name: str, known: Iterable[str], kind: str, hint: str) -> None:
 
 
 def model_at(place: str) -> tuple[Any, Any, Any, int]:
-    """Return the results of the function at `MODULE:FUNCTION`: `F`, `x_example`, `args_example`,
-    `order`."""
+    """Return what the function at `MODULE:FUNCTION` does: `F`, `x_example`, `args_example`, `order`."""
     module, _, name = place.partition(":")
     if not module or not name:
         raise typer.BadParameter(

@@ -163,8 +163,7 @@ class ConstraintInArgs(AbstractConstraint):
 
 
 def _names_in(name: str, tree: Any) -> list[str]:
-    """Return the names of the numbers in a tree, in the order in which it is ravelled: `args.length`,
-    `y0.0.1`."""
+    """Return the names of the numbers in a ravelled tree: `args.length`, `y0.0.1`."""
     out = []
     for path, leaf in jtu.tree_flatten_with_path(tree)[0]:
         words = jtu.keystr(path, simple=True, separator=".")

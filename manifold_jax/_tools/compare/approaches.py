@@ -97,8 +97,7 @@ def _plain(problem: Problem, solver: dfx.AbstractSolver, gain: float) -> Formula
 def _within(
     hook: Callable, options: Callable[[Problem, float], dict[str, Any]] = lambda problem, gain: {}
 ) -> Formulate:
-    """Use the solver in a step hook of this library, with `options(problem, gain)`, and the field as it
-    is."""
+    """Use the solver in a step hook of this library, with `options(problem, gain)`."""
 
     def formulate(problem: Problem, solver: dfx.AbstractSolver, gain: float) -> Formulation:
         wrapped = hook(solver, problem.constraint, **options(problem, gain))

@@ -70,8 +70,7 @@ def comparison_title(task: Task) -> str:
     return f"{task.problem.name}, {task.solver}, {span}, rtol = {task.rtol:g}, atol = {task.atol:g}"
 
 
-# Short headings, so that they fit in a terminal of 80 columns; then the attribute of a row, and its
-# format.
+# Headings that fit in a terminal of 80 columns; then the attribute of a row, and its format.
 _COLUMNS = {
     "steps\naccepted": ("accepted", "d"),
     "\nrejected": ("rejected", "d"),
