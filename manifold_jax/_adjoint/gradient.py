@@ -12,7 +12,7 @@ from .replay import State
 
 
 class Ends(NamedTuple):
-    """Where a solve began and ended, its numbers of steps, and the state at its end."""
+    """The ends of a solve, its numbers of steps, and the state at its end."""
 
     t0: FloatScalar
     t1: FloatScalar  # where it was supposed to end

@@ -26,7 +26,7 @@ _BYTES, _STATES = 2**20, 512
 
 
 class Sizes(NamedTuple):
-    """How the steps of a solve are divided into blocks, and blocks into segments."""
+    """The division of the steps of a solve into blocks, and of blocks into segments."""
 
     block: int  # steps in a block
     segment: int  # blocks in a segment

@@ -31,26 +31,25 @@ class StepReplayAdjoint(dfx.AbstractAdjoint):
     r"""The derivative of the discrete solution, in reverse and in forward mode; the default of
     [`diffeqsolve`][].
 
-    From the accepted steps $y_{i+1} = \Phi(t_i, t_{i+1}, y_i, \theta)$ and the gradient
+    For the accepted steps $y_{i+1} = \Phi(t_i, t_{i+1}, y_i, \theta)$ and the gradient
     $\bar y_n$ with respect to the last state
 
     $$\bar y_i = (\partial\Phi/\partial y_i)^T \bar y_{i+1} + (\partial s_i/\partial y_i)^T \bar s_i, \qquad
       \bar\theta = \sum_i (\partial\Phi/\partial\theta)^T \bar y_{i+1} + \dots$$
 
-    with $s_i$ what was saved in step $i$, events and the dense solution included. The solve
-    records $(t_i, t_{i+1})$ and some $y_i$, and the reverse sweep computes each step once more, of the
-    size that was recorded. `diffrax.RecursiveCheckpointAdjoint` repeats parts of the solve with its
+    with $s_i$ the values saved in step $i$, events and the dense solution included. The solve
+    records $(t_i, t_{i+1})$ and some $y_i$, and the reverse sweep computes each step again, with the
+    recorded size. `diffrax.RecursiveCheckpointAdjoint` repeats parts of the solve with its
     controller instead: rounded differently, repeated steps get other sizes, and its gradient is
     that of another solution. At tight tolerances it is less accurate than the solve, and with
-    additive methods (`KenCarp3` and a `MultiTerm`) it can be plainly wrong.
+    additive methods (`KenCarp3` and a `MultiTerm`) it can be wrong.
 
     Forward mode differentiates the solve itself with the ends of its steps held fixed, so that both
     modes give the same numbers. (It still makes the record: where only forward mode is needed,
     `diffrax.ForwardMode()` takes less memory.)
 
     Derivatives are those with respect to `y0`, `args`, all that terms, constraints and `fn` hold or
-    close over, `t0`, `t1` and `SaveAt(ts=...)`. Under `vmap` all trajectories go back with one
-    common counter.
+    close over, `t0`, `t1` and `SaveAt(ts=...)`. Under `vmap` all trajectories share one counter.
 
     **Arguments:**
 
@@ -64,10 +63,10 @@ class StepReplayAdjoint(dfx.AbstractAdjoint):
 
     `ValueError` for an `UnsafeBrownianPath`. `RuntimeError` when differentiating with
     `max_steps=None`, as there is no room for the record, or with respect to `dt0`, on which a
-    solution depends by its error alone. Both modes can be differentiated forwards once more
+    solution depends only by its error. Both modes can be differentiated in forward mode once more
     (Hessian-vector products), but not in reverse mode: for that use `diffrax.DirectAdjoint()`.
-    With thousands of parameters in common under `vmap` (neural networks)
-    each trajectory sums up a gradient of its own.
+    Under `vmap` each trajectory sums up a gradient with respect to shared parameters, also if they
+    are thousands (neural networks).
 
     Source: Griewank & Walther, Evaluating Derivatives (2008), ch. 12, without recursion.
     """
@@ -164,8 +163,8 @@ def _while_loop(*args: Any, checkpoints: Any = None, **kwargs: Any) -> Any:
 
 @ForwardRule
 def _solve(differentiable, record, remembers):
-    """Return what the loop returns; the part of it that has derivatives; and what the reverse sweep
-    needs, the record and the final state."""
+    """Return the result of the loop; its differentiable part; the record and the final state, for the
+    reverse sweep."""
     *_, run = differentiable
     (state, statistics), record = run(record)
     return (state, statistics), outputs_of(state, remembers), (record, state)

@@ -84,7 +84,7 @@ def trace_curve(
     """Follow the curve `H(x, args) = 0`, `n` equations in `n + 1` unknowns, by arclength.
 
     Solves `dx/ds = tau(x)`, `x(0) = x0` on the curve, where `DH tau = 0`, `|tau| = 1` and
-    the sign of `det [DH; tau^T]` stays what it was at `x0`. Folds, where a parameter among
+    the sign of `det [DH; tau^T]` stays that at `x0`. Folds, where a parameter among
     the unknowns turns back, are points like any other. Closed curves go round again.
 
     **Arguments:**
@@ -116,7 +116,7 @@ def trace_curve(
     if the start is not near the curve or singular, or if the trace meets a singular point. At every
     step the tangent must turn by less than 60 degrees and agree with the chord.
 
-    What it cannot see between two steps (at most `length / 50` apart): a pair of turning points,
+    Two things between steps (at most `length / 50` apart) go unnoticed: a pair of turning points,
     and a singular point at which the tangent hardly turns (branches that touch; or that cross at
     less than a degree, with tolerances above 1e-8). There is no branch switching; AUTO and
     BifurcationKit have it, and sparse matrices for more than about a hundred unknowns.

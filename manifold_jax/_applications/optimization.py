@@ -41,7 +41,7 @@ _MESSAGES = (
 
 
 class ConstrainedMinimum(eqx.Module):
-    """Where a [`gradient_flow`][] ended, and whether that is a minimum.
+    """The end of a [`gradient_flow`][], and whether it is a minimum.
 
     With `G = dg/dx` and the Lagrangian `L(x, lambda) = f(x) + lambda . g(x)`:
 

@@ -41,7 +41,7 @@ def evaluated(tree: Any, args: Args) -> Any:
 
 
 def check_function(name: str, function: Any, call: str, *keywords: str, advice: str = "") -> None:
-    """Refuse what cannot be called like `call`, for example `g(t, y, args)`: with that many
+    """Refuse arguments that cannot be called like `call`, for example `g(t, y, args)`: with that many
     arguments, and `keywords` for a trailing `**kwargs`."""
     if not callable(function):
         advice = f" {advice}" if advice else ""

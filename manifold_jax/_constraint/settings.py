@@ -15,7 +15,7 @@ from .._base.types import RealScalarLike, Y
 
 
 class NewtonProjection(eqx.Module):
-    """How to correct a point `y`: to `p = y + V z`, `V = W^-1 G(y)^T`, by a simplified Newton
+    """Settings of the correction of a point `y` to `p = y + V z`, `V = W^-1 G(y)^T`, by a simplified Newton
     iteration on the `m` multipliers `z`.
 
     `V` is fixed at the point that is corrected, and `z` the root of the square system
@@ -35,13 +35,13 @@ class NewtonProjection(eqx.Module):
 
     **Arguments:**
 
-    - `metric`: the norm in which the correction is orthogonal. `None` is the identity, or
-        `"error"` with an `atol` below the rounding of a number of size one, which says that components far
-        smaller count, too; and the mass matrix for the constraint of a [`MechanicalSystem`][].
-        `"identity"` in any case; `"error"` for
-        the norm of the step size controller, `w_j = 1 / (atol + rtol |y_j|)^2`; or a pytree
-        like `y` of positive weights `w_j`, large for components that should stay put.
-    - `max_steps`: the most Newton iterations before the projection fails. 1 is a method of
+    - `metric`: the norm in which the correction is orthogonal. By default, `None`, the mass matrix for
+        the constraint of a [`MechanicalSystem`][]; otherwise the identity, or `"error"` if `atol` is
+        below the rounding of a number of size one, so that far smaller components count, too.
+        `"identity"` in any case; `"error"` for the norm of the step size controller, `w_j = 1 / (atol
+        + rtol |y_j|)^2`; or a pytree like `y` of positive weights `w_j`, large for components that
+        should hardly move.
+    - `max_steps`: the largest number of Newton iterations before the projection fails. 1 is a method of
         its own, post-stabilization: one Newton step per step of the solver, successful if it
         lowers the residual; states are then near the manifold (the square of the local error),
         not on it to round-off.

@@ -45,7 +45,7 @@ def without_cancellations(found: Analysis) -> Analysis:
 
 
 class Cancelled(NamedTuple):
-    """A combination that replaces one of the equations, and what it no longer contains, `gone[k, j]`."""
+    """A combination that replaces an equation, and the derivatives it has lost, `gone[k, j]`."""
 
     combination: Combination
     gone: np.ndarray

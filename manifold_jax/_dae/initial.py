@@ -165,7 +165,7 @@ def _check_constraints(
     free: Float[Array, " states"],
 ) -> tuple[FloatScalar, BoolScalar]:
     """Return the largest scaled residual of the hidden constraints at a state, and whether their
-    gradients with respect to what may move are independent."""
+    gradients with respect to free components are independent."""
     t, z, args, c = leading.t, leading.z, leading.args, system.analysis.c
     r, G = jacobian(lambda z: system.hidden_constraints(t, z, args, 0, c, w), z)
     if r.size == 0:  # there may be no state at all

@@ -28,7 +28,7 @@ _SINGULAR = (
 
 
 class Reduced(eqx.Module):
-    """Equations with their analysis: what all parts of a reduced system share."""
+    """Equations with their analysis, shared by all parts of a reduced system."""
 
     equations: Equations
     analysis: Analysis = eqx.field(static=True)

@@ -60,13 +60,13 @@ class ReducedDAE(eqx.Module):
         - `args`: the parameters.
         - `derivatives`: guesses for `x', x'', ...`, each like `x_guess`, for states that are derivatives
             without a name of their own; zero if not given.
-        - `fixed`: names of what must not move, of whole arrays (`"q"`, of an array alone `"x"`) or
+        - `fixed`: names of fixed unknowns, of whole arrays (`"q"`, of an array alone `"x"`) or
             numbers (`"q[0]"`), with `'` for derivatives, as in `report.states`.
         - `throw`: raise if there is no such state. With `throw=False` look at `info.success`.
 
         **Returns:**
 
-        `(z, info)`: the state, the nearest one of the manifold in what is not fixed (the root of
+        `(z, info)`: the state, the nearest one of the manifold in the unknowns that are not fixed (the root of
         `z - z_guess + W^-1 G^T lambda = 0`, `g(t0, z) = 0` with `G` at `z` itself), then unknowns that became states
         as equations are nonlinear in them, from those; and a [`ProjectionInfo`][]. The derivative
         with respect to all arguments is exact, however far the guess is.
@@ -75,7 +75,7 @@ class ReducedDAE(eqx.Module):
 
         `ValueError` for names that are not states, a guess unlike `x_example`, and a
         `RuntimeError` if no state near satisfies the equations, if they cannot be satisfied
-        with what is fixed, or if they do not determine the derivatives at the state found
+        with the fixed unknowns, or if they do not determine the derivatives at the state found
         (redundant equations, singular configurations; outside of `jit` it says which).
         """
         guess = Guess.of(self.system, x_guess, derivatives, fixed)

@@ -77,7 +77,7 @@ def fit(
     - `parameters`: the values to start from, any pytree of real numbers and arrays, `p` in all.
     - `ts`: increasing times of the measurements, shape `(times,)`; or `(records, times)` for
         many trajectories with the same parameters.
-    - `data`: what was measured at `ts`, like the state (or what `observe` returns), leaves
+    - `data`: the measurements at `ts`, like the state (or what `observe` returns), leaves
         with a leading axis `(times,)` or `(records, times)`.
     - `y0`: the initial state at `t0`, with a leading axis `(records,)` if there are many; or a
         function `y0(parameters)`. It is moved onto the manifold. Default: that of the problem.
@@ -98,7 +98,7 @@ def fit(
         (`optx.BFGS`), or any Optax optimizer. Steps of the unknowns are relative to the start
         values. Prefer the default, but Optax for more than about 50 parameters (then by reverse
         mode and without standard errors) or more records than can be solved in each step.
-    - `steps`: the most of them; `patience`: stop after so many without a decrease.
+    - `steps`: the largest number of steps; `patience`: stop after so many without a decrease.
     - `batch_size`: with Optax, records in each step, in an order drawn with `seed`; `steps` then counts
         passes through all records.
     - `starts`: how many times to fit, of which the best is kept and all are listed
@@ -116,7 +116,7 @@ def fit(
     - `solver`: a Diffrax solver, wrapped in [`Projected`][], or a function of the constraint.
     - `stepsize_controller`, `dt0`, `max_steps`: as for [`diffeqsolve`][]. The default tolerance
         is 1e-8 (1e-5 in single precision).
-    - `progress`: whether to say what is being compiled and how far the steps are: by a progress bar
+    - `progress`: whether to report compilation and steps: by a progress bar
         on a terminal, by lines in a file or a notebook.
     - `throw`: whether a fit that did not end well raises; otherwise look at `result.success`.
 

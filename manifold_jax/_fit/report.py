@@ -31,7 +31,7 @@ class Start(NamedTuple):
 
 
 class FitResult(eqx.Module):
-    """What [`fit`][] found. Arrays are NumPy's; `print(result)` is a report.
+    """The result of [`fit`][]. Arrays are NumPy's; `print(result)` is a report.
 
     - `parameters`: the estimates, in the structure of the start values.
     - `standard_errors`: likewise; infinite where the data do not determine a parameter, NaN for one at

@@ -14,7 +14,7 @@ from .primitives import arranged_factors, ELEMENTWISE, evaluated, MOVES, sources
 
 
 class Value(NamedTuple):
-    """What is known of an array of shape `S`."""
+    """The dependence of an array of shape `S` on the inputs."""
 
     # On which inputs each number depends. The last column is a flag, whether the number may be other
     # than zero: for sums and moves it follows the same rule.
@@ -167,7 +167,7 @@ def _scattered(equation: Any, values: list[Value]) -> list[Value] | None:
     places = _landing(equation, shape, indices.known, update.depends.shape[:-1]).ravel()
     lands = places >= 0
     result = operand.depends.reshape(-1, number).copy()
-    if equation.primitive.name == "scatter":  # what was there is replaced
+    if equation.primitive.name == "scatter":  # replaces the numbers there
         result[places[lands]] = False
     np.logical_or.at(result, places[lands], update.depends.reshape(-1, number)[lands])
     return [Value(result.reshape(*shape, number))]

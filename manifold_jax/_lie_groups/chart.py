@@ -18,7 +18,7 @@ class LieGroupChart(mj.AbstractChart):
 
     $$y = y_0\,\phi(w), \qquad w' = d\phi_w^{-1}(\xi), \quad \xi = y^{-1} f(t, y), \quad w(t_0) = 0,$$
 
-    with the exponential or Cayley's map $\phi$. The order of the wrapped solver is kept.
+    with the exponential or Cayley's map $\phi$. The order of the wrapped solver is preserved.
 
     ```python
     def field(t, y, args):

@@ -39,8 +39,8 @@ class AbstractLieGroup(eqx.Module):
 
     @abc.abstractmethod
     def is_within(self, w: Float[Array, " d"], cayley: bool) -> Bool[Array, ""]:
-        r"""Whether $\phi$ is a chart at `w`, well inside; a step that leaves it is rejected. False for
-        what is not finite."""
+        r"""Whether $\phi$ is a chart at `w`, well inside; a step that leaves it is rejected. False if
+        `w` is not finite."""
 
 
 def check_shape(y: Any, shape: tuple[int, ...], group: str) -> None:

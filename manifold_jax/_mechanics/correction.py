@@ -50,7 +50,7 @@ class InverseMetrics(NamedTuple):
 
 
 class TwoStages(NamedTuple):
-    """How a state is corrected; `directions` are `V^T` if they are not those of the state itself."""
+    """The correction of a state; `directions` are `V^T` if they are not those of the state itself."""
 
     here: Kinematics
     projection: NewtonProjection

@@ -114,17 +114,17 @@ class Assembly(eqx.Module):
         t: RealScalarLike = 0.0,
         args: Args = None,
     ) -> tuple[Pose, Pose]:
-        """A state `(q, v)`: the drawing at rest, with what is given for some bodies by name.
+        """Return a state `(q, v)`: the drawing at rest, with other values for some bodies by name.
 
         **Arguments:**
 
         - `positions`, `velocities` of centres of mass; `orientations`, as for [`Body`][];
-            `angular_velocities` (rad/s), a number, or in space shape `(3,)`, in the coordinates of
-            space.
-        - `assemble`: keep what is given, and find the rest such that all joints are satisfied, the
-            nearest to the drawing and the slowest. Also inside of `jit`, `vmap` and derivatives, by
-            lengths and by what is given; joints that cannot be closed are then an error while the
-            program runs. (Without it traced states are not checked.)
+            `angular_velocities` (rad/s), a number, or in space shape `(3,)`, in world
+            coordinates.
+        - `assemble`: keep the given values, and find the rest such that all joints are satisfied: the
+            nearest to the drawing, and the slowest. Also inside `jit`, `vmap` and derivatives, with
+            respect to lengths and given values; joints that cannot be closed are then an error at
+            run time. (Without it traced states are not checked.)
         - `t`, `args`: the time of the start and the `args` of the solve, for what [`Drive`][]s prescribe.
 
         **Raises** `ValueError` where joints are not satisfied (without `assemble`) or cannot be:

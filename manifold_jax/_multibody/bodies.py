@@ -57,8 +57,8 @@ class Body(eqx.Module):
     - `inertia` (kg m^2) about the centre of mass: a number for a body in the plane; for one in
         space the moments about the axes of its frame, shape `(3,)`, or the matrix `(3, 3)`.
     - `position` of the centre of mass (m), shape `(2,)` or `(3,)`, and `orientation` (an angle,
-        or a unit quaternion, scalar first, see [`quaternion`][]) in the *drawing*, the pose in
-        which joints are described. Default: at the origin, not turned.
+        or a unit quaternion, scalar first, see [`quaternion`][]) in the *drawing*, the reference
+        configuration in which joints are described. Default: at the origin, not turned.
 
     Numbers may be traced by JAX. **Raises** `ValueError` for shapes, masses and inertias that no
     body has. A thin rod without a moment about its own axis has no well-defined spin: give a small

@@ -49,7 +49,7 @@ def from_mujoco(
     damper). The drawing is the pose `qpos0`. Stiffness of hinges counts angles from `-pi` to `pi`.
 
     **Raises** `ValueError` with the names of all elements that are not supported: tendons, contacts,
-    limits, friction, armature, and so on. What does not act on the motion (geometries that do not
+    limits, friction, armature, and so on. Elements without effect on the motion (geometries that do not
     collide, sites, sensors, cameras) is left out.
     """
     mujoco = import_mujoco()

@@ -135,7 +135,7 @@ class Rodas5P(AbstractRosenbrock):
     [`LocalCoordinates`][] and [`Stabilized`][] (without one). All adjoints work; derivatives
     are those of the steps, second derivatives of `f` included.
 
-    Order 5 is kept for non-autonomous equations, for `M y' = f` with constant or regular
+    The order is 5 for non-autonomous equations, for `M y' = f` with constant or nonsingular
     `M(t, y)` and for DAEs of index 1 with constant `M`; with a singular `M` that depends on time or
     state it is 3. Fast components that follow a forcing, $y' = \lambda (y - \varphi(t)) +
     \varphi'(t)$ (Prothero & Robinson), have errors of order $h^3 / |\lambda|$ while
@@ -161,7 +161,7 @@ class Rodas3P(AbstractRosenbrock):
     r"""Rosenbrock method of order 3 (error estimate of order 2, dense output 3) with five stages and
     three evaluations of the vector field, for loose tolerances; all else as [`Rodas5P`][].
 
-    Order 3 is kept as order 5 is by [`Rodas5P`][]; with a singular `M` that depends on time or
+    The order is 3 where that of [`Rodas5P`][] is 5; with a singular `M` that depends on time or
     state it is 2. Fast components that follow a forcing have errors of order $h^2 / |\lambda|$.
 
     Source: Steinebach, Rosenbrock methods within OrdinaryDiffEq.jl - Overview, recent developments

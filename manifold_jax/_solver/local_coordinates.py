@@ -25,7 +25,7 @@ class LocalCoordinates(AbstractManifoldSolver):
     every step (the paper's parameterization approach).
 
     At the beginning of each step a chart `x = lift(w)` is set up, `w' = f(t, lift(w))` is advanced by
-    one step of the wrapped solver, and the result lifted. The order of the wrapped solver is kept. Its
+    one step of the wrapped solver, and the result lifted. The order of the solver is preserved. Its
     error estimate is pushed forward to the state, so that the tolerances mean the same as for the other
     approaches. A stage that has no point on the manifold near it rejects the step.
 

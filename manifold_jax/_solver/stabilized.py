@@ -23,8 +23,8 @@ class Stabilized(AbstractManifoldSolver):
     (constraint stabilization).
 
     Works forward and backward in time: violations decay in the direction of integration.
-    What is returned is not corrected (except with `ExactStabilization(0)`): the violation
-    is of the size of the tolerance. Use [`Projected`][] for values on the manifold.
+    Results are not corrected (except with `ExactStabilization(0)`): the violation is of the
+    size of the tolerance. Use [`Projected`][] for values on the manifold.
 
     **Arguments:**
 

@@ -63,7 +63,7 @@ class Problem(eqx.Module):
     - `start`: what the initial state is made from: one given by the user, a standard one, or
         `None` for the standard one of `args`.
     - `initial_state`: `(args, start) -> y0`, by default `start` itself.
-    - `invariants`: `(t, y, args)`, what is conserved. Frozen at `y0` they are the constraint.
+    - `invariants`: `(t, y, args)`, conserved quantities. Frozen at `y0` they are the constraint.
     - `exact`: `(t, args, y0) -> y` in NumPy, `t` of shape `(times,)`; the leaves of
         `y` get that leading axis. Raises `ValueError` where it does not hold.
     - `reference_at_end_only`: whether `reference` knows the solution at `t1` alone.

@@ -62,8 +62,8 @@ def stream_ensemble(
     resume: bool = False,
     progress: bool = True,
 ) -> StoredEnsemble:
-    """Solve for more trajectories than fit into memory, or than one dares to lose: make them one
-    chunk at a time, solve them with [`solve_ensemble`][] and write them to a folder.
+    """Solve for more trajectories than fit into memory, or than you can afford to lose: generate them
+    chunk by chunk, solve them with [`solve_ensemble`][] and write them to a folder.
 
     ```python
     def sample(index, key):  # of one trajectory, any JAX code
@@ -80,7 +80,7 @@ def stream_ensemble(
 
     Memory is that of one chunk, whatever the `size`. A run that was interrupted, also by a
     killed process, is continued by the same call with `resume=True`: at most one chunk is computed
-    again, and the files are bit by bit those of a run without interruption (on the same kind of
+    again, and the files are bit-identical to those of a run without interruption (on the same kind of
     device and with the same versions). Every file is written under another name and then renamed.
 
     **Arguments:**
@@ -88,7 +88,7 @@ def stream_ensemble(
     - `sample`: `(index, key) -> (y0, args)`, the initial value and the parameters of the trajectory
         numbered `index`, from 0 on; `key` is `jax.random.fold_in(jax.random.key(seed), index)`.
         Traced and mapped over: write it with `jax.numpy`. It must depend on nothing else that changes.
-        What it returns in `args` as it is, without computing it, is common to all.
+        Leaves of `args` that it does not compute are common to all.
     - `size`: the number of trajectories.
     - `path`: the folder; made if it does not exist, and refused if it is not empty unless `resume`.
     - `terms`, `solver`, `dt0`, `saveat`, `stepsize_controller`, `max_steps`, `lanes`, `consistent`:
@@ -97,9 +97,9 @@ def stream_ensemble(
     - `chunk`: how many trajectories are solved and written together. Much larger than `lanes`, as
         lanes run empty at the end of each chunk.
     - `seed`: of the random numbers.
-    - `resume`: continue what is in `path`, or begin if there is nothing. Chunks that are missing or
+    - `resume`: continue the run in `path`, or begin one if the folder is empty. Chunks that are missing or
         damaged are computed again. Refused if the settings stored there differ, `terms`, constraint
-        and `sample` included, but for what a `jax.pure_callback` calls, which cannot be seen.
+        and `sample` included, except for the function that a `jax.pure_callback` calls.
     - `progress`: show how far it is, trajectories per second, and how many have failed.
 
     **Returns:**

@@ -1,4 +1,4 @@
-"""The inputs of an ensemble, divided into what is differentiated and the rest."""
+"""The inputs of an ensemble, divided into a differentiated part and the rest."""
 
 import dataclasses
 from collections.abc import Callable

@@ -25,9 +25,9 @@ class Group(NamedTuple):
     """The trajectories that go back together, one in each lane."""
 
     index: Array  # (lanes,)
-    present: Array  # whether it is one, and anything depends on it
-    each: Columns  # what it has of its own, differentiated
-    rest: Columns  # and not differentiated
+    present: Array  # whether there is one, with a cotangent other than zero
+    each: Columns  # its own data that are differentiated
+    rest: Columns  # those that are not
     at_times: Stacked | None  # cotangents of its states at `ts`, with the times in front
 
 
@@ -50,5 +50,5 @@ class Bars(NamedTuple):
 class Record(NamedTuple):
     """The steps of a segment, which are the leading axis of every array."""
 
-    steps: Stacked  # where they begin and end, and from which state
+    steps: Stacked  # their start and end times, and the states before them
     accepted: Array  # (steps, lanes)

@@ -34,14 +34,14 @@ _BYTES = 2**22
 class ReverseSweep:
     """Cotangents of the inputs of `N` trajectories from those of their outputs, in [`Ends`][].
 
-    - `each`, `rest`, `starts`: what each trajectory has of its own, differentiated and not, and where
-        it begins. `firsts`, `first_bar`, `last_bar`: its first state, and the cotangents of that and
+    - `each`, `rest`, `starts`: the data that each trajectory has of its own, differentiated and not,
+        and its start. `firsts`, `first_bar`, `last_bar`: its first state, and the cotangents of that and
         of the last one. Columns of shape `(N,)`.
     - `values_bar`: the cotangents of the values at `ts`, columns of shape `(N * times,)`.
-    - `common`, `no_common`: what all have in common; zeros like its cotangents, which are summed up
+    - `common`, `no_common`: the common data; zeros like their cotangents, which are summed
         in each lane, columns of shape `(lanes,)`.
     - `solver_state`: zeros, for the part of a solver's state that steps do not depend on.
-    - `smooth_layout`: how the differentiable part of what a step depends on is laid out in columns.
+    - `smooth_layout`: the layout of the differentiable part of the state that a step depends on.
     - `rows`: the number of steps in a segment. `needed`: see `_needed`.
     """
 
@@ -108,13 +108,13 @@ class ReverseSweep:
             return (record, bars.common), bars.each
 
     def _state_bar(self, y_bar: Columns) -> Columns:
-        """Extend the cotangent of a state by zeros for what the solver remembers."""
+        """Extend the cotangent of a state by zeros for the solver's memory."""
         zeros = Columns.zeros(self.smooth_layout, self.lanes.count)
         columns = [*y_bar.columns, *zeros.columns[len(y_bar.columns) :]]
         return Columns(columns, self.smooth_layout)
 
     def _through_values(self, group: Group, common: Columns) -> tuple[Group, Bars]:
-        """Begin the sweep: transpose what was computed from the states at `ts`, time by time."""
+        """Begin the sweep: transpose the saved values of the states at `ts`, time by time."""
         index, none = group.index, jtu.tree_map(jnp.zeros_like, group.each)
         rows = self.ends.rows[index]
         last_bar = self._state_bar(taken(self.last_bar, index))

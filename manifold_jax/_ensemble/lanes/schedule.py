@@ -21,7 +21,7 @@ _STEPS = 8
 
 
 class Lane(NamedTuple):
-    """What the lanes hold: the number of the trajectory in each, its own data and state, and the next
+    """The contents of all lanes: the number of the trajectory in each, its own data and state, and the next
     time to save at."""
 
     number: Array
@@ -44,7 +44,7 @@ class Totals(NamedTuple):
 class Run(NamedTuple):
     """The results of all trajectories, which are the leading axis of every array. `rows`: how many of
     the times to save at each has reached. `states`: a table of the interpolated states there,
-    trajectory after trajectory, with a row for each time. `values`: what is saved of them, `failed`:
+    trajectory after trajectory, with a row for each time. `values`: their saved values, `failed`:
     whether any of these could not be corrected."""
 
     start: Any  # `Start` and `Outcome`, or those of other `equations`

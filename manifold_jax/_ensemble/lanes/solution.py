@@ -24,14 +24,14 @@ from ..._solve.outcome import (
 class EnsembleSolution(eqx.Module):
     """The solutions of `N` trajectories, in the order of the initial values.
 
-    - `ts`: the times of what was saved, `(N, T)`; infinite where a trajectory did not get there, and with
+    - `ts`: the times of saved values, `(N, T)`; infinite where a trajectory did not get there, and with
       `SaveAt(t1=True)` the time at which it stopped: see `failed`.
     - `ys`: the saved values, `(N, T, ...)`.
     - `stats`: as of [`diffeqsolve`][] without `max_steps`, each of shape `(N,)`.
     - `result`: the result codes of all trajectories.
     - `execution`: "in lanes", or why not.
-    - `messages`: what the result codes mean, by number; the last three say of a trajectory without
-        steps that its times or its start could not be used.
+    - `messages`: those of the result codes, by number; the last three are for a trajectory without
+        steps whose times or start could not be used.
     """
 
     ts: PyTree[Array]

@@ -26,9 +26,9 @@ class StoredEnsemble:
 
     - `group`: the folder as a `zarr.Group`, of the arrays below.
     - `ts`, `ys`, `stats`: as of [`EnsembleSolution`][], `zarr.Array`s or groups of them.
-    - `result`: numbers of what happened, 0 where all is well, -1 for what has not been computed yet;
-        `messages` says what they mean.
-    - `settings`: what it was computed with.
+    - `result`: result codes, 0 for success, -1 for trajectories that have not been computed yet;
+        `messages` has their meaning.
+    - `settings`: the settings of the run.
     - `faults()`: which of its files are missing or damaged.
     - `size`, `chunk`, `finished`: how many trajectories it has at its end, in one piece, and by now.
     - `num_failed`: how many of those that are finished failed.
@@ -113,7 +113,7 @@ def open_ensemble(path: str | Path, *, check: bool = True) -> StoredEnsemble:
     - `path`: its folder. Without this library, `zarr.open_group(path)` opens the same.
     - `check`: read all of its files once, and refuse if some are missing or damaged. Otherwise nothing
         but its description is read: a chunk that is missing reads as NaN (as -1 in `result`),
-        one that is damaged is an error of zarr's, and `faults()` of what is returned lists them.
+        one that is damaged is an error of zarr's, and `faults()` of the result lists them.
 
     **Returns:**
 

@@ -104,8 +104,8 @@ class InChunks(eqx.Module):
             x_j = g_j - B_j s' - A_j s,
             g_j = R_j (y_j - W_j g_{j+1}),    B_j = R_j (F_j - W_j B_{j+1}),    A_j = -R_j W_j A_{j+1}.
 
-        What is left of the rows `L x_k + D s + U x_1 = r` of the last blocks, with `x_1`, `g_1`, `B_1` and
-        `A_1` of the chunk after and `M = L R_k`, is a system of the same form for `s`:
+        The remaining rows `L x_k + D s + U x_1 = r` of the last blocks, with `x_1`, `g_1`, `B_1` and
+        `A_1` of the chunk after and `M = L R_k`, are a system of the same form for `s`:
 
             -M F_k s' + (D - M W_k - U B_1) s - U A_1 s'' = r - M y_k - U g_1.
         """

@@ -81,7 +81,7 @@ def check_name(name: str, known: Iterable[str], kind: str, hint: str) -> None:
 
 
 def model_at(place: str) -> tuple[Any, Any, Any, int]:
-    """Return what the function at `MODULE:FUNCTION` does: `F`, `x_example`, `args_example`, `order`."""
+    """Return the results of `MODULE:FUNCTION`: `F`, `x_example`, `args_example`, `order`."""
     module, _, name = place.partition(":")
     if not module or not name:
         raise typer.BadParameter(

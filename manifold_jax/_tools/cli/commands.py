@@ -167,7 +167,9 @@ def certify(
     hessian: Annotated[
         bool, typer.Option("--hessian", help="Hessian-vector products, too (twice the time).")
     ] = False,
-    tolerance: Annotated[float, typer.Option(help="Of the steps, relative and absolute.")] = 1e-6,
+    tolerance: Annotated[
+        float, typer.Option(help="Tolerance of the steps, relative and absolute.")
+    ] = 1e-6,
     t1: options.EndTime = None,
     json: options.JsonFile = None,
 ) -> None:

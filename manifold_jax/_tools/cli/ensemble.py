@@ -37,7 +37,7 @@ def ensemble(
     rtol: options.RelativeTolerance = 1e-6,
     atol: options.AbsoluteTolerance = 1e-6,
     t1: options.EndTime = None,
-    seed: Annotated[int, typer.Option(help="Of the random numbers.")] = 0,
+    seed: Annotated[int, typer.Option(help="Seed of the random numbers.")] = 0,
     lanes: Annotated[
         int, typer.Option(min=1, help="How many trajectories advance together.")
     ] = DEFAULT_LANES,

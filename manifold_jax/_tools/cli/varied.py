@@ -39,7 +39,7 @@ class Distribution(NamedTuple):
         return f"{self.target}={self.kind}({self.a}, {self.b})"
 
 
-# What the two numbers of each kind have to be.
+# Conditions on the two numbers of each kind.
 _KINDS = {
     "uniform": ("uniform(low, high) needs low < high", lambda a, b: a < b),
     "normal": ("normal(mean, std) needs std > 0", lambda a, b: b > 0),

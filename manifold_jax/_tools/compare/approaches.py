@@ -18,7 +18,7 @@ from ...problems import Problem
 
 
 class Formulation(NamedTuple):
-    """What is integrated: the function that solves, and its first two arguments."""
+    """A problem as it is integrated: the function that solves, and its first two arguments."""
 
     function: Callable[..., dfx.Solution]
     terms: dfx.AbstractTerm
@@ -67,7 +67,7 @@ class Approach:
     - `name`: on the command line and in tables.
     - `formulate`: of a problem, a Diffrax solver and a gain (1/time, for stabilization).
     - `style`: in pictures.
-    - `needs`: what a problem has to have, `None` if it is for all.
+    - `needs`: a requirement on the problem, `None` if it is for all.
     - `uses_gain`: whether the gain matters.
 
     Those of other packages are found by the entry point group `manifold_jax.approaches`, each a

@@ -28,7 +28,7 @@ def number_columns(headings: Iterable[str]) -> list[Column]:
 
 
 def format_number(value: int | float | str | None, form: str) -> str:
-    """Format a number in a table, in which a word may stand instead, and `-` for what is not known.
+    """Format a number in a table, in which a word may stand instead, and `-` for unknown ones.
     Where `form` asks for three digits, larger numbers have all before the point."""
     if isinstance(value, str):
         return value
