@@ -22,7 +22,7 @@ class Ends(NamedTuple):
     y: Y
 
 
-class Step(NamedTuple):
+class RecordedStep(NamedTuple):
     """One recorded step, or several along leading axes."""
 
     start: Float[Array, "*steps"]
@@ -37,14 +37,15 @@ class Step(NamedTuple):
 
 
 class TimesBar(NamedTuple):
-    """Cotangents of the ends of the solve and of the times of `SaveAt(ts=...)`. The ends of all other
-    steps are held fixed."""
+    """Cotangents of the ends of the solve and of the times of `SaveAt(ts=...)`; other steps are fixed."""
 
     t0: FloatScalar
     t1: FloatScalar
     ts: list[Float[Array, " times"] | None]
 
-    def at_ends_of_step(self, ends: Ends, step: Step, start_bar: Any, end_bar: Any) -> "TimesBar":
+    def at_ends_of_step(
+        self, ends: Ends, step: RecordedStep, start_bar: Any, end_bar: Any
+    ) -> "TimesBar":
         t0 = self.t0 + jnp.where(step.start == ends.t0, start_bar, 0)
         return self._replace(t0=t0, t1=self.t1 + jnp.where(step.end == ends.t1, end_bar, 0))
 

@@ -15,9 +15,9 @@ from .._base.closure import convert_closure
 from .._base.compat import Differentiable, LoopState, Progress
 from .._base.types import Args, RealScalarLike, Y
 from .._constraint.projection_info import ProjectionInfo
-from .._solver.step.advance import HookState
 from .._solver.step.execution import execution_of, ExplicitStep
 from .._solver.step.frame import StepFrame
+from .._solver.step.hook_state import HookState
 
 
 class State(NamedTuple):
@@ -146,8 +146,7 @@ def may_jump(controller: Any, made_jump: Any) -> bool:
 
 
 def outputs_of(final_state: LoopState, remembers: bool) -> Differentiable:
-    """Return the differentiable part of the final state of a loop; of the solver's state, the part that
-    steps depend on."""
+    """Return the differentiable part of a final state; of the solver's state, what steps depend on."""
     found = Differentiable.of(final_state)
     return found._replace(solver_state=memory_of(found.solver_state) if remembers else None)
 

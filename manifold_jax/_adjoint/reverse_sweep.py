@@ -9,7 +9,7 @@ import jax.tree_util as jtu
 
 from .._base.compat import unvmap_max
 from .._base.types import IntScalar
-from .gradient import add, Ends, Gradient, Step, TimesBar
+from .gradient import add, Ends, Gradient, RecordedStep, TimesBar
 from .record import counted_down, Record, rows_backwards, Vectors
 from .replay import Replay, State
 from .saved import Functions, SavedValues
@@ -62,7 +62,7 @@ class ReverseSweep(eqx.Module):
         counts = (saving.num_times for saving in self.functions.rest.savings)
         return TimesBar(zero, zero, [jnp.zeros(n, zero.dtype) if n else None for n in counts])
 
-    def _steps_of_segment(self, i: IntScalar) -> Step:
+    def _steps_of_segment(self, i: IntScalar) -> RecordedStep:
         """Return the steps of a segment, with leading axes for blocks and steps."""
         record, sizes = self.record, self.record.sizes
         part = lambda x, i: lax.dynamic_slice_in_dim(x, i * sizes.segment, sizes.segment)
@@ -75,7 +75,7 @@ class ReverseSweep(eqx.Module):
         times = start, end, jumped, accepted
         last = max(sizes.kept // sizes.segment - 1, 0)
         kept = lambda: {k: part(x, jnp.minimum(i, last)) for k, x in record.states.items()}
-        again = lambda: self._states_again(i, Step(*times, {}))
+        again = lambda: self._states_again(i, RecordedStep(*times, {}))
         if not record.firsts:
             states = kept()
         elif not record.states:
@@ -84,9 +84,9 @@ class ReverseSweep(eqx.Module):
             states = lax.cond(i <= last, kept, again)
         first = record.packing.pack(self.first)
         used = lambda x, first: jnp.where(accepted[..., None], x, first)
-        return Step(*times, {k: used(x, first[k]) for k, x in states.items()})
+        return RecordedStep(*times, {k: used(x, first[k]) for k, x in states.items()})
 
-    def _states_again(self, i: IntScalar, steps: Step) -> Vectors:
+    def _states_again(self, i: IntScalar, steps: RecordedStep) -> Vectors:
         """Compute the states of a segment again from its first one."""
         record, packing = self.record, self.record.packing
 
@@ -114,7 +114,7 @@ class ReverseSweep(eqx.Module):
         count = jnp.minimum(-(-begun // sizes.block), sizes.segment)
         return counted_down(count, through_block, gradient)
 
-    def _through_step(self, gradient: Gradient, step: Step) -> Gradient:
+    def _through_step(self, gradient: Gradient, step: RecordedStep) -> Gradient:
         state = self.record.packing.unpack(step.state)
         smooth, discrete = eqx.partition(state, eqx.is_inexact_array)
 
@@ -125,7 +125,7 @@ class ReverseSweep(eqx.Module):
         (after, dense_info), pullback = self.functions.vjp(out, smooth, ends, times is not None)
         new = gradient
         for k in range(len(self.functions.rest.savings)):
-            new = self.saved.behind_step(new, k, step, after.y)
+            new = self.saved.after_step(new, k, step, after.y)
         zero = jtu.tree_map(jnp.zeros_like, dense_info)
         bar = self.dense.of(gradient.number, self.ends.num_accepted, zero)
         for k in range(len(self.functions.rest.savings)):

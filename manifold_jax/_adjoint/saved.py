@@ -11,7 +11,7 @@ import jax.tree_util as jtu
 from jaxtyping import Array, Bool, Float
 
 from .._base.types import FloatScalar, IntScalar, RealScalarLike, Y
-from .gradient import add, Ends, Gradient, replaced, Step
+from .gradient import add, Ends, Gradient, RecordedStep, replaced
 from .replay import Replay
 
 
@@ -40,8 +40,7 @@ class Functions(eqx.Module):
 
 
 class Rows(NamedTuple):
-    """The rows of one saving: their times, how many come before that of the end, and the cotangents of
-    times and values."""
+    """The rows of one saving: times, how many precede that of the end, cotangents of times and values."""
 
     times: Float[Array, " rows"]
     count: IntScalar
@@ -101,7 +100,7 @@ class SavedValues(eqx.Module):
         leaves = add(gradient.leaves, leaves_bar)
         return gradient._replace(state=state, leaves=leaves, times=times)
 
-    def behind_step(self, gradient: Gradient, k: int, step: Step, y: Y) -> Gradient:
+    def after_step(self, gradient: Gradient, k: int, step: RecordedStep, y: Y) -> Gradient:
         """Transpose the row of the state after a step, if it was saved."""
         saving, rows, row = self._savings[k], self.rows[k], gradient.rows[k]
         if not saving.steps:
@@ -115,7 +114,7 @@ class SavedValues(eqx.Module):
         return gradient._replace(rows=replaced(gradient.rows, k, row - jnp.where(saved, 1, 0)))
 
     def inside_step(
-        self, gradient: Gradient, k: int, step: Step, dense_info: Any, bar: Any
+        self, gradient: Gradient, k: int, step: RecordedStep, dense_info: Any, bar: Any
     ) -> tuple[Gradient, Any]:
         """Transpose the rows interpolated in a step; return the cotangent of `dense_info`, too."""
         saving, rows = self._savings[k], self.rows[k]

@@ -53,20 +53,18 @@ class StepReplayAdjoint(dfx.AbstractAdjoint):
 
     **Arguments:**
 
-    - `checkpoints`: the largest number of states to record. By default those of the first 512
-        steps, or as many as fit into 1 MiB, and about `sqrt(max_steps)` of the others; the states
-        between two of these are computed again, once, about `sqrt(max_steps)` at a time.
-        `checkpoints=max_steps` records every state. Memory, besides these states: three numbers
-        for each of `max_steps`.
+    - `checkpoints`: the largest number of states to record. By default those of the first 512 steps, or
+        as many as fit into 1 MiB, and about `sqrt(max_steps)` of the others; the states between two of
+        these are computed again, once, about `sqrt(max_steps)` at a time. `checkpoints=max_steps`
+        records every state. Memory, besides these states: three numbers for each of `max_steps`.
 
     **Raises:**
 
-    `ValueError` for an `UnsafeBrownianPath`. `RuntimeError` when differentiating with
-    `max_steps=None`, as there is no room for the record, or with respect to `dt0`, on which a
-    solution depends only by its error. Both modes can be differentiated in forward mode once more
-    (Hessian-vector products), but not in reverse mode: for that use `diffrax.DirectAdjoint()`.
-    Under `vmap` each trajectory sums up a gradient with respect to shared parameters, also if they
-    are thousands (neural networks).
+    `ValueError` for an `UnsafeBrownianPath`. `RuntimeError` when differentiating with `max_steps=None`,
+    as there is no room for the record, or with respect to `dt0`, on which a solution depends only by
+    its error. Both modes can be differentiated in forward mode once more (Hessian-vector products), but
+    not in reverse mode: for that use `diffrax.DirectAdjoint()`. Under `vmap` each trajectory sums up a
+    gradient with respect to shared parameters, also if they are thousands (neural networks).
 
     Source: Griewank & Walther, Evaluating Derivatives (2008), ch. 12, without recursion.
     """
@@ -163,8 +161,7 @@ def _while_loop(*args: Any, checkpoints: Any = None, **kwargs: Any) -> Any:
 
 @ForwardRule
 def _solve(differentiable, record, remembers):
-    """Return the result of the loop; its differentiable part; the record and the final state, for the
-    reverse sweep."""
+    """Return the result of the loop; its differentiable part; the record and the final state."""
     *_, run = differentiable
     (state, statistics), record = run(record)
     return (state, statistics), outputs_of(state, remembers), (record, state)

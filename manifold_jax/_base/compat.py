@@ -147,8 +147,7 @@ class LastStep(NamedTuple):
 
 
 class Differentiable(NamedTuple):
-    """The differentiable part of the final state of a loop: neither its statistics nor the state of
-    the step size controller."""
+    """The differentiable part of the final state of a loop: no statistics, no controller state."""
 
     ts: list[Any]
     ys: list[Any]

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .occurrence import Example, nonlinear_unknowns, Occurrence
-from .signature import Structure
+from .signature import DAEStructure
 
 
 class Aliases(NamedTuple):
@@ -93,20 +93,20 @@ def _candidates(example: Example, occurrence: Occurrence) -> list[Any]:
     return found
 
 
-def lifted(example: Example, aliases: Aliases, structure: Structure) -> Structure:
+def lifted(example: Example, aliases: Aliases, structure: DAEStructure) -> DAEStructure:
     """Return the structure with the fewest differentiations in which the equations with `c_i = 0`, too,
     are linear in the leading derivatives."""
     belongs_to = np.argsort(structure.transversal)
     while (found := _nonlinear(example, aliases, structure)).any():
         at_least = structure.c.copy()
         at_least[belongs_to[found]] += 1
-        raised = Structure.of(structure.sigma, at_least)
+        raised = DAEStructure.of(structure.sigma, at_least)
         assert raised is not None
         structure = raised
     return structure
 
 
-def _nonlinear(example: Example, aliases: Aliases, structure: Structure) -> np.ndarray:
+def _nonlinear(example: Example, aliases: Aliases, structure: DAEStructure) -> np.ndarray:
     """Return which leading derivatives occur nonlinearly in equations that are not differentiated."""
     levels = structure.d[aliases.columns] - aliases.shift
     (unknowns,) = np.nonzero((levels >= 0) & (levels <= example.equations.order))

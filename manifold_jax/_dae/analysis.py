@@ -10,14 +10,14 @@ from jaxtyping import Array, Float
 
 from .._base.types import Args
 from .aliases import Aliases, lifted
+from .block_elimination import Elimination
 from .compressed import Compressed
 from .derivatives import pick, total_derivatives
-from .equations import Equations
-from .layout import Layout
+from .equations import ResidualEquations
+from .layout import StateLayout
 from .occurrence import Example, Occurrence
-from .pivots import Elimination
 from .samples import Samples
-from .signature import signature, Structure
+from .signature import DAEStructure, signature
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -31,24 +31,24 @@ class Analysis:
 
     example: Example
     occurrence: Occurrence
-    written: Structure
-    unlifted: Structure
-    layout: Layout
+    written: DAEStructure
+    unlifted: DAEStructure
+    layout: StateLayout
     entries: Compressed
     implicit: bool
 
     @staticmethod
     def of(example: Example, occurrence: Occurrence, implicit: bool) -> "Analysis | None":
         """Analyse equations; return `None` if the structure is singular."""
-        written = Structure.of(signature(occurrence.there))
+        written = DAEStructure.of(signature(occurrence.there))
         if written is None:
             return None
         aliases, order = Aliases.of(example, occurrence), example.equations.order
         there = aliases.merged(occurrence.there)
-        unlifted = Structure.of(signature(there))
+        unlifted = DAEStructure.of(signature(there))
         assert unlifted is not None
         structure = unlifted if implicit else lifted(example, aliases, unlifted)
-        layout = Layout.of(structure, aliases, order)
+        layout = StateLayout.of(structure, aliases, order)
         entries = Compressed.of(structure, aliases, there, order + 1)
         return Analysis(example, occurrence, written, unlifted, layout, entries, implicit)
 
@@ -106,7 +106,7 @@ class Analysis:
 
     def differentiated(
         self,
-        equations: Equations,
+        equations: ResidualEquations,
         t: Array,
         jets: tuple[Array, ...],
         args: Args,

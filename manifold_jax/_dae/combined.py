@@ -18,7 +18,7 @@ from jaxtyping import Array
 
 from .._jaxpr.incidence import incidence
 from .analysis import Analysis
-from .equations import Combination
+from .equations import EquationCombination
 from .occurrence import Example, Occurrence, tracked
 from .samples import singular_below
 
@@ -47,7 +47,7 @@ def without_cancellations(found: Analysis) -> Analysis:
 class Cancelled(NamedTuple):
     """A combination that replaces an equation, and the derivatives it has lost, `gone[k, j]`."""
 
-    combination: Combination
+    combination: EquationCombination
     gone: np.ndarray
 
 
@@ -74,7 +74,7 @@ def cancelled(analysis: Analysis) -> list[Cancelled]:
             continue
         target = int(rows[np.argmax(np.abs(weights))])
         parts = tuple(zip(rows.tolist(), weights.tolist(), strict=True))
-        found.append(Cancelled(Combination(target, parts), gone))
+        found.append(Cancelled(EquationCombination(target, parts), gone))
     return found
 
 

@@ -11,7 +11,7 @@ from .._base.types import Args
 from .._linalg.coloring import greedy_colors
 from .aliases import Aliases
 from .derivatives import pick
-from .signature import Structure
+from .signature import DAEStructure
 
 
 class Compressed(NamedTuple):
@@ -22,7 +22,9 @@ class Compressed(NamedTuple):
     places: np.ndarray  # (rows, columns) in the flat derivatives, -1 for zero
 
     @staticmethod
-    def of(structure: Structure, aliases: Aliases, there: np.ndarray, levels: int) -> "Compressed":
+    def of(
+        structure: DAEStructure, aliases: Aliases, there: np.ndarray, levels: int
+    ) -> "Compressed":
         """Color the columns; `there` is the occurrence of the equations and unknowns that are left."""
         rows, columns = np.nonzero(structure.leading)
         orders = structure.sigma[rows, columns]

@@ -8,16 +8,16 @@ from jaxtyping import Array, Float
 from .._base.types import Args
 from .._linalg.newton import AbstractEquations, implicit_root, without_derivative
 from .analysis import Analysis
+from .block_elimination import Eliminated
 from .derivatives import pick
-from .equations import Equations
-from .pivots import Eliminated
+from .equations import ResidualEquations
 
 
 class HighestDerivatives(AbstractEquations):
     """The leading equations `F_i^(c_i) = 0` at one state, for the leading derivatives
     `w_j = x_j^(d_j)`; linear in them unless the form is implicit."""
 
-    equations: Equations
+    equations: ResidualEquations
     t: Array
     z: Float[Array, " a"]
     args: Args

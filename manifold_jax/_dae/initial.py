@@ -22,7 +22,7 @@ from .._linalg.newton import find_root, implicit_root, SquareSystem, without_der
 from .._linalg.pivoted import factorize_equilibrated
 from .equations import leaf_names, listed
 from .highest_derivatives import HighestDerivatives
-from .layout import Gather, Layout
+from .layout import Gather, StateLayout
 from .nearest import Constrained, nearest_state, with_lifted
 from .reduced import Reduced
 from .samples import condition, dependent_rows, singular_below
@@ -51,7 +51,7 @@ class Guess(NamedTuple):
         return Guess(z, w, _fixed(system, x, fixed), tuple(fixed))
 
 
-def _places_in_guess(layout: Layout, names: np.ndarray, number: int) -> Gather:
+def _places_in_guess(layout: StateLayout, names: np.ndarray, number: int) -> Gather:
     """Return where each of these numbers is in the `number` guesses of `x, x', ...`: under its own
     name, or as a derivative of another unknown of which it is an alias."""
     aliases, n = layout.aliases, len(layout.aliases.root)

@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 
 from .aliases import Aliases
 from .derivatives import pick
-from .signature import Structure
+from .signature import DAEStructure
 
 
 class Gather(NamedTuple):
@@ -27,12 +27,12 @@ class Gather(NamedTuple):
         return picked * jnp.asarray(self.scale, z.dtype)
 
 
-class Layout(NamedTuple):
+class StateLayout(NamedTuple):
     """The layout of the state `z`. `names` has for each of its numbers the derivative and the unknown
     whose name it has; `places` for each unknown that is left where its derivatives are: below `d_j` in
     `z`, and `x_j^(d_j)` in the leading derivatives `w`, which are counted after `z`."""
 
-    structure: Structure
+    structure: DAEStructure
     aliases: Aliases
     names: np.ndarray  # (states, 2): derivative, unknown
     places: np.ndarray  # (levels, roots)
@@ -52,7 +52,7 @@ class Layout(NamedTuple):
         return np.array(found, int).reshape(-1, 2)
 
     @staticmethod
-    def of(structure: Structure, aliases: Aliases, order: int) -> "Layout":
+    def of(structure: DAEStructure, aliases: Aliases, order: int) -> "StateLayout":
         """Put the user's own unknowns first, in their order, then derivatives without a name."""
         n, d = len(aliases.root), structure.d
         places = np.full((int(d.max(initial=0)) + 1, len(d)), -1)
@@ -64,7 +64,7 @@ class Layout(NamedTuple):
                     places[m, j] = len(names)
                     names.append((k, unknown))
         places[d, np.arange(len(d))] = len(names) + np.arange(len(d))
-        return Layout(structure, aliases, np.array(names, int).reshape(-1, 2), places)
+        return StateLayout(structure, aliases, np.array(names, int).reshape(-1, 2), places)
 
     def scale(self) -> np.ndarray:
         """The factor of each state relative to the derivative of its root."""

@@ -54,7 +54,7 @@ class _Approach(NamedTuple):
 
     z: Float[Array, " n"]
     multipliers: Float[Array, " m"]
-    level: FloatScalar
+    last_step: FloatScalar
     damping: FloatScalar
     iterations: IntScalar
 
@@ -78,13 +78,13 @@ def _approach(g: Constrained, guess: Float[Array, " n"], m: int) -> _Approach:
         z = state.z - state.damping * step
         better = there | (jnp.max(jnp.abs(g(z))) < jnp.max(jnp.abs(r)))
         z = jnp.where(better, z, state.z) + jnp.where(there, along / 2, 0)
-        level = jnp.maximum(jnp.max(jnp.abs(along)), jnp.max(jnp.abs(step)))
-        damping = jnp.where(better, jnp.ones_like(level), state.damping / 4)
-        return _Approach(z, multipliers, level, damping, state.iterations + 1)
+        last_step = jnp.maximum(jnp.max(jnp.abs(along)), jnp.max(jnp.abs(step)))
+        damping = jnp.where(better, jnp.ones_like(last_step), state.damping / 4)
+        return _Approach(z, multipliers, last_step, damping, state.iterations + 1)
 
     def unfinished(state: _Approach) -> BoolScalar:
         size = 1 + jnp.max(jnp.abs(state.z))
-        return (state.level > rounding * size) & (state.iterations < _MAX_STEPS)
+        return (state.last_step > rounding * size) & (state.iterations < _MAX_STEPS)
 
     one, none = jnp.ones((), guess.dtype), jnp.zeros((m,), guess.dtype)
     start = _Approach(guess, none, jnp.inf * one, one, jnp.zeros((), jnp.int32))
@@ -117,7 +117,7 @@ def nearest_state(g: Constrained, guess: Float[Array, " n"]) -> NearestState:
     found = jnp.concatenate([near.z, near.multipliers])
     root = implicit_root(SquareSystem(convert_closure(stationarity, found)), found)
     size = 1 + jnp.max(jnp.abs(near.z))
-    settled = near.level <= float(jnp.finfo(guess.dtype).eps) ** 0.5 * size
+    settled = near.last_step <= float(jnp.finfo(guess.dtype).eps) ** 0.5 * size
     return NearestState(root[: guess.size], root[guess.size :], near.iterations, settled)
 
 
@@ -128,10 +128,10 @@ def _polished(equations: SquareSystem, start: Float[Array, " k"]) -> Float[Array
     equations, start = without_derivative((equations, start))
 
     def advance(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-        z, level, _ = state
+        z, last_step, _ = state
         dz = equations.linearize(z).solve(equations.residual(z))
         size = jnp.max(jnp.abs(dz) / jnp.maximum(jnp.abs(z), jnp.finfo(z.dtype).tiny))
-        smaller = size < level / 2
+        smaller = size < last_step / 2
         return jnp.where(smaller, z - dz, z), size, smaller & (size > 0)
 
     first = start, jnp.asarray(jnp.inf, start.dtype), jnp.asarray(True)

@@ -11,21 +11,21 @@ from jaxtyping import Array
 from .._base.types import Args
 from .._jaxpr.incidence import incidence
 from .derivatives import pick
-from .equations import Equations
+from .equations import ResidualEquations
 
 
 class Example(NamedTuple):
     """Equations and a point at which they are evaluated: a time, the vectors `(x, x', ...)` and
     parameters, whose arrays can be traced."""
 
-    equations: Equations
+    equations: ResidualEquations
     t: Array
     jets: tuple[Array, ...]
     args: Any
     fixed_args: Any
 
     @staticmethod
-    def of(equations: Equations, x: Array, args: Args) -> "Example":
+    def of(equations: ResidualEquations, x: Array, args: Args) -> "Example":
         """Take zero derivatives. Floats in `args` are parameters like arrays; all else is constant."""
         is_parameter = lambda leaf: eqx.is_inexact_array_like(leaf) or eqx.is_array(leaf)
         traced, fixed = eqx.partition(args, is_parameter)
@@ -57,8 +57,7 @@ class Occurrence(NamedTuple):
 
     @staticmethod
     def of(example: Example) -> "Occurrence":
-        """Find the occurrence. The time and all parameters together count as one input each, after
-        those of the jets."""
+        """Find the occurrence; time and parameters are one input each, after those of the jets."""
         shape = n, levels, _ = example.equations.n, example.equations.order + 1, example.equations.n
         each = np.eye(n * levels, n * levels + 2, dtype=bool)
         time, parameters = np.eye(2, n * levels + 2, n * levels, dtype=bool)

@@ -17,7 +17,7 @@ from .._constraint.constraint import AbstractConstraint
 from .._constraint.residual import as_time
 from .._linalg.newton import implicit_root
 from .analysis import Analysis
-from .equations import Equations
+from .equations import ResidualEquations
 from .highest_derivatives import HighestDerivatives
 
 
@@ -30,7 +30,7 @@ _SINGULAR = (
 class Reduced(eqx.Module):
     """Equations with their analysis, shared by all parts of a reduced system."""
 
-    equations: Equations
+    equations: ResidualEquations
     analysis: Analysis = eqx.field(static=True)
 
     def leading_equations(self, t: Any, z: Array, args: Args) -> HighestDerivatives:

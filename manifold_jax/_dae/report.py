@@ -22,8 +22,7 @@ class DAEReport:
         equation, -1 where it is absent.
     - `c`, `d`: the offsets, `(n,)` each: how often each equation is differentiated, and up to which
         derivative each unknown then occurs.
-    - `index`: the structural index, `max c`, and one more where an unknown is only found
-        algebraically.
+    - `index`: the structural index, `max c`, and one more where an unknown is only found algebraically.
     - `degrees_of_freedom`: `sum d - sum c`, how many initial values are free.
     - `states`: names of the numbers of the state; `num_constraints` equations hold of them.
     - `dropped`: equations like `x' - v = 0`, which are solved by name.

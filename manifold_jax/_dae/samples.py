@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from .layout import Layout
+from .layout import StateLayout
 from .occurrence import Example
 
 
@@ -26,7 +26,7 @@ class Samples(NamedTuple):
         return max(self.conditions) < singular_below(self.matrices[0].dtype)
 
     @staticmethod
-    def of(matrix: Callable, example: Example, layout: Layout) -> "Samples":
+    def of(matrix: Callable, example: Example, layout: StateLayout) -> "Samples":
         """Take samples of `matrix(t, y, args)`; `y` has the states and then the leading derivatives."""
         matrices = []
         for t, y in _points(layout, np.asarray(example.jets[0])):
@@ -45,7 +45,7 @@ def singular_below(dtype: np.dtype) -> float:
     return float(np.finfo(dtype).eps) ** 0.75
 
 
-def _points(layout: Layout, x: np.ndarray) -> list[tuple[Array, np.ndarray]]:
+def _points(layout: StateLayout, x: np.ndarray) -> list[tuple[Array, np.ndarray]]:
     random = np.random.default_rng(0)
     order, unknown = np.concatenate([layout.names, layout.leading_names()]).T
     found = []

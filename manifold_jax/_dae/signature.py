@@ -15,7 +15,7 @@ from scipy.sparse.csgraph import maximum_bipartite_matching
 ABSENT = -(10**6)
 
 
-class Structure(NamedTuple):
+class DAEStructure(NamedTuple):
     """A signature matrix `sigma_ij`, the order of the highest derivative of unknown `j` in equation
     `i`, with the smallest offsets `c_i` (differentiations of equation `i`) and `d_j` (order of the
     highest derivative of unknown `j` afterwards) with `d_j - c_i >= sigma_ij`, and equality on the
@@ -42,7 +42,7 @@ class Structure(NamedTuple):
         return int(self.c.max(initial=0)) + int((self.d == 0).any())
 
     @staticmethod
-    def of(sigma: np.ndarray, at_least: np.ndarray | None = None) -> "Structure | None":
+    def of(sigma: np.ndarray, at_least: np.ndarray | None = None) -> "DAEStructure | None":
         """Find the offsets; return `None` if no assignment of unknowns to equations exists. `at_least`
         are lower bounds of the `c_i`."""
         n = len(sigma)
@@ -55,13 +55,13 @@ class Structure(NamedTuple):
             d = (sigma + c[:, None]).max(axis=0, initial=ABSENT)
             raised = np.maximum(c, d[transversal] - on_transversal)
             if (raised == c).all():
-                return Structure(sigma, transversal, c, d)
+                return DAEStructure(sigma, transversal, c, d)
             c = raised
 
 
 def signature(occurs: np.ndarray) -> np.ndarray:
-    """Return the signature matrix from `occurs[i, k, j]`: whether the derivative `k` of unknown
-    `j` is in equation `i`."""
+    """Return the signature matrix from `occurs[i, k, j]`: derivative `k` of unknown `j` in equation
+    `i`."""
     highest = occurs.shape[1] - 1 - np.argmax(occurs[:, ::-1], axis=1)
     return np.where(occurs.any(axis=1), highest, ABSENT)
 

@@ -14,7 +14,7 @@ from .model import as_function_of_constraint, Simulator
 from .optimize import Options
 from .parameters import make_transform
 from .pieces import make_pieces
-from .progress import Meter
+from .progress import FitMeter
 from .report import FitResult
 from .setup import check_initial, check_options, make_objective, refuse_tracers
 from .starts import choose, draw_points, optimize_all, see, with_scales
@@ -158,7 +158,7 @@ def fit(
     observed = eqx.filter_eval_shape(simulator.observation, jnp.zeros(()), y, start)
     t0 = getattr(model, "t0", None) if t0 is None and hasattr(model, "with_args") else t0
     records = make_records(ts, data, sigma, missing, t0, observed)
-    meter = Meter(progress)
+    meter = FitMeter(progress)
     options = Options(optimizer, steps, patience, batch_size, seed, starts, meter)
     check_options(options, loss, segments, records)
     with meter:
@@ -182,8 +182,7 @@ def fit(
 
 
 def _unknowns(objective: Any, options: Options) -> list[Any]:
-    """Return the unknowns at all starts: those of the parameters, then those of initial states, which
-    are at their guess."""
+    """Return the unknowns at all starts: of the parameters, then of initial states (at their guess)."""
     transform, d = objective.transform, objective.pieces.basis.shape[-1]
     states = objective.free.size * d
     # Each joint has as many equations as the state there has unknowns.

@@ -74,8 +74,7 @@ class Solved(NamedTuple):
 
 
 def solve(u: Unknowns, objective: Objective, batch: Any = None) -> Solved:
-    """Solve all pieces, or those of a batch. Failed ones give zeros, so that none of their values
-    enters a derivative."""
+    """Solve all pieces, or those of a batch. Failed ones give zeros, which enter no derivative."""
     x, pieces = objective.chosen(jax.lax.stop_gradient(u), batch)
 
     def one(x: Any, piece: Piece) -> Solved:
@@ -118,7 +117,7 @@ def weighted(objective: Objective, predicted: Prediction) -> Float[Array, "piece
     return jnp.where(predicted.failed[:, None, None] > 0, penalty, r)
 
 
-class Linearized(NamedTuple):
+class LinearizedResiduals(NamedTuple):
     """Weighted residuals, the gaps, and their derivatives; the slopes `d theta / d u`."""
 
     r: Float[Array, "pieces L k"]
@@ -129,7 +128,7 @@ class Linearized(NamedTuple):
 
 
 @eqx.filter_jit
-def linearize(u: Unknowns, solved: Solved, objective: Objective) -> Linearized:
+def linearize(u: Unknowns, solved: Solved, objective: Objective) -> LinearizedResiduals:
     def both(u: Any) -> Any:
         predicted = solved.around(u, objective)
         out = weighted(objective, predicted), gaps(objective, predicted)
@@ -137,7 +136,7 @@ def linearize(u: Unknowns, solved: Solved, objective: Objective) -> Linearized:
 
     (J, C), (r, c) = jax.jacfwd(both, has_aux=True)(u)
     slopes = jax.jvp(objective.transform.values, (u,), (jnp.ones_like(u),))[1]
-    return Linearized(r, J, c, C, slopes)
+    return LinearizedResiduals(r, J, c, C, slopes)
 
 
 def stacked(u: Any, solved: Solved, objective: Objective) -> tuple[np.ndarray, np.ndarray]:
@@ -159,8 +158,8 @@ def residuals(u: Unknowns, objective: Objective) -> tuple[Any, Any]:
 
 
 def total_loss(u: Unknowns, objective: Objective, batch: Any = None) -> tuple[FloatScalar, Any]:
-    """Return the loss for minimizers: the sum over all records, or the mean over those of a batch; then
-    as `residuals`."""
+    """Return the loss for minimizers: the sum over records, or the mean over a batch; then as
+    `residuals`."""
     x, pieces = objective.chosen(u, batch)
     if objective.reverse:
         one = lambda x, piece: _backwards(x, (piece, objective.simulator))

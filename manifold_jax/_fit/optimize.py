@@ -13,7 +13,7 @@ import optimistix as optx
 from .bounds import BESIDE, driven, linear_step, on_bounds, put_beside_bounds, put_on_bounds
 from .convergence import at_minimum, flat, stalled
 from .objective import gaps, Objective, residuals, Solved, total_loss
-from .progress import Meter
+from .progress import FitMeter
 
 
 class Options(NamedTuple):
@@ -25,14 +25,14 @@ class Options(NamedTuple):
     batch_size: int | None
     seed: int
     starts: int
-    meter: Meter
+    meter: FitMeter
 
     @property
     def by_gradient(self) -> bool:
         return isinstance(self.optimizer, optax.GradientTransformation)
 
 
-class Outcome(NamedTuple):
+class OptimizerOutcome(NamedTuple):
     """The final unknowns, all pieces and the loss there, the loss of each step, and the message."""
 
     u: Any
@@ -55,7 +55,7 @@ def look(u: Any, objective: Objective, options: Options) -> tuple[Any, Solved]:
 _loss = eqx.filter_jit(total_loss)
 
 
-def optimize(objective: Objective, u: Any, options: Options) -> Outcome:
+def optimize(objective: Objective, u: Any, options: Options) -> OptimizerOutcome:
     if options.by_gradient:
         return _with_optax(objective, u, options)
     if objective.joints.size == 0:
@@ -63,7 +63,7 @@ def optimize(objective: Objective, u: Any, options: Options) -> Outcome:
     return _closing_gaps(objective, u, options)
 
 
-def _within_bounds(objective: Objective, u: Any, options: Options) -> Outcome:
+def _within_bounds(objective: Objective, u: Any, options: Options) -> OptimizerOutcome:
     """Optimize with bounds. Each parameter is put on a bound at most once, and at most once taken off
     again, if it belongs inside after the others have moved."""
     transform = objective.transform
@@ -95,7 +95,7 @@ def _within_bounds(objective: Objective, u: Any, options: Options) -> Outcome:
 
 def _with_optimistix(
     objective: Objective, u: Any, options: Options, losses: list[float], movable: np.ndarray
-) -> Outcome:
+) -> OptimizerOutcome:
     """Optimize step by step through the public methods of the solver, which return the values at the
     point from which they step. End early if a `movable` parameter is driven to a bound."""
     solver, done, okay, message = options.optimizer, False, True, None
@@ -116,7 +116,7 @@ def _with_optimistix(
             message = "converged"
         else:
             u, done, okay = new, bool(new_done), bool(new_okay)
-    return Outcome(u, solved, losses, losses[-1], message == "converged", message)
+    return OptimizerOutcome(u, solved, losses, losses[-1], message == "converged", message)
 
 
 def _function_for(solver: Any) -> Callable:
@@ -139,7 +139,7 @@ def _advance(solver: Any, u: Any, objective: Objective, state: Any) -> Any:
     return u, state, seen, done, result == optx.RESULTS.successful
 
 
-def _closing_gaps(objective: Objective, u: Any, options: Options) -> Outcome:
+def _closing_gaps(objective: Objective, u: Any, options: Options) -> OptimizerOutcome:
     """Multiple shooting: close the gaps at the joints, which vanish in the limit.
 
     An augmented Lagrangian, `sum r^2 + w^2 sum (c + s)^2`: after each fit `s` grows by the gaps that
@@ -163,7 +163,7 @@ def _closing_gaps(objective: Objective, u: Any, options: Options) -> Outcome:
     return found._replace(losses=losses, loss=np.inf, success=False, message=message)
 
 
-def _with_optax(objective: Objective, u: Any, options: Options) -> Outcome:
+def _with_optax(objective: Objective, u: Any, options: Options) -> OptimizerOutcome:
     """Take epochs of one batch each, or of a random order of all records cut into batches."""
     records, size = objective.pieces.start.size, options.batch_size
     random = np.random.default_rng(options.seed)
@@ -187,7 +187,7 @@ def _with_optax(objective: Objective, u: Any, options: Options) -> Outcome:
             message = "the loss decreases no more"
             break
     solved = look(best[1], objective, options)[1]
-    return Outcome(best[1], solved, losses, best[0], True, message)
+    return OptimizerOutcome(best[1], solved, losses, best[0], True, message)
 
 
 @eqx.filter_jit

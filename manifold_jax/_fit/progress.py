@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from .._base.extras import NoBar, print_line, terminal_bar
 
 
-class Meter:
+class FitMeter:
     """A progress meter, silent unless `shown`.
 
     Lines of steps are at least a second and a tenth of the elapsed time apart.
@@ -21,7 +21,7 @@ class Meter:
         self.name, self.listed, self.count, self.steps = "fit", False, 0, 0
         self.begun = self.last = time.perf_counter()
 
-    def __enter__(self) -> "Meter":
+    def __enter__(self) -> "FitMeter":
         self.bar.start()
         return self
 

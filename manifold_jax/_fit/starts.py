@@ -8,7 +8,7 @@ import jax.tree_util as jtu
 import numpy as np
 
 from .objective import Objective, weighted
-from .optimize import look, optimize, Options, Outcome
+from .optimize import look, optimize, OptimizerOutcome, Options
 from .parameters import Transform
 from .report import Start
 from .setup import refuse_tracers
@@ -90,7 +90,7 @@ def with_scales(objective: Objective, seen: list[Seen]) -> Objective:
 
 def optimize_all(
     objective: Objective, points: list[Any], seen: list[Seen], options: Options
-) -> tuple[Outcome, tuple[Start, ...]]:
+) -> tuple[OptimizerOutcome, tuple[Start, ...]]:
     """Optimize one start after the other with the same compiled program, as compiling takes longer than
     a few fits. Return the best, and a table of all with the best first."""
     best, rows, several = None, [], len(points) > 1
@@ -111,7 +111,7 @@ def optimize_all(
     return best, (chosen, *others)  # pyright: ignore[reportReturnType]
 
 
-def _better(new: Outcome, old: Outcome) -> bool:
+def _better(new: OptimizerOutcome, old: OptimizerOutcome) -> bool:
     """Whether the new result is better; of the same optimum, the one where the optimizer converged."""
     if abs(new.loss - old.loss) <= _SAME * abs(old.loss) and new.success != old.success:
         return new.success

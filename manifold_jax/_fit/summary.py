@@ -12,14 +12,14 @@ import numpy as np
 from .._constraint.project import consistent_state
 from .data import Records, unflatten
 from .objective import Objective
-from .optimize import Outcome
+from .optimize import OptimizerOutcome
 from .pieces import edges_of
 from .quality import judge
 from .report import FitResult, Start
 
 
 def summarize(
-    objective: Objective, outcome: Outcome, starts: tuple[Start, ...], records: Records
+    objective: Objective, outcome: OptimizerOutcome, starts: tuple[Start, ...], records: Records
 ) -> FitResult:
     u, transform = outcome.u, objective.transform
     observed, *_, failed = jtu.tree_map(np.asarray, outcome.solved.values)

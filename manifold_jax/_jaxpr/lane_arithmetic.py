@@ -12,7 +12,7 @@ from jax import lax
 
 from . import primitives
 from .lane_arrays import Lanes
-from .lane_value import Number, object_array, Value
+from .lane_value import LaneValue, Number, object_array
 from .primitives import evaluated, unsharded
 
 
@@ -21,7 +21,7 @@ ELEMENTWISE = frozenset({*primitives.VANISHING, *primitives.ELEMENTWISE}).union(
 )
 
 
-def elementwise(lanes: Lanes, equation: Any, values: list[Value]) -> list[Value]:
+def elementwise(lanes: Lanes, equation: Any, values: list[LaneValue]) -> list[LaneValue]:
     aval = equation.outvars[0].aval
     operands = [np.broadcast_to(v.numbers(), aval.shape) for v in values]
     params = unsharded(equation.params)
@@ -29,7 +29,7 @@ def elementwise(lanes: Lanes, equation: Any, values: list[Value]) -> list[Value]
         apply(lanes, equation.primitive, params, aval.dtype, [x[index] for x in operands])
         for index in np.ndindex(*aval.shape)
     ]
-    return [Value.of_numbers(object_array(out, aval.shape), aval.dtype)]
+    return [LaneValue.of_numbers(object_array(out, aval.shape), aval.dtype)]
 
 
 def apply(

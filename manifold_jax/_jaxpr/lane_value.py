@@ -34,7 +34,7 @@ class Node:
 Number = Any
 
 
-class Value:
+class LaneValue:
     """An array of shape `shape` in each lane, in two forms. `numbers()` is an object array of that
     shape of [`Number`][]s; `whole(lanes)` an array of shape `(*shape, count)`: the lanes are
     contiguous in memory.
@@ -47,24 +47,24 @@ class Value:
         self._make, self._numbers, self._whole = make, None, None
 
     @staticmethod
-    def of_numbers(numbers: np.ndarray, dtype: Any) -> "Value":
-        return Value(numbers.shape, dtype, lambda: numbers)
+    def of_numbers(numbers: np.ndarray, dtype: Any) -> "LaneValue":
+        return LaneValue(numbers.shape, dtype, lambda: numbers)
 
     @staticmethod
-    def of_constant(x: Any) -> "Value":
+    def of_constant(x: Any) -> "LaneValue":
         """Make a value that is the same in every lane from an array, which may be traced."""
         x = x if isinstance(x, jax.core.Tracer) else np.asarray(x)
-        return Value(x.shape, x.dtype, lambda: _split(x, x.shape))
+        return LaneValue(x.shape, x.dtype, lambda: _split(x, x.shape))
 
     @staticmethod
-    def of_column(x: jax.Array) -> "Value":
+    def of_column(x: jax.Array) -> "LaneValue":
         """Make a value from one number of each lane."""
-        return Value.of_numbers(object_array([x], ()), x.dtype)
+        return LaneValue.of_numbers(object_array([x], ()), x.dtype)
 
     @staticmethod
-    def of_whole(x: jax.Array) -> "Value":
+    def of_whole(x: jax.Array) -> "LaneValue":
         """Make a value from one array whose last axis is that of the lanes."""
-        value = Value(x.shape[:-1], x.dtype, lambda: _split(x, x.shape[:-1]))
+        value = LaneValue(x.shape[:-1], x.dtype, lambda: _split(x, x.shape[:-1]))
         value._whole = x
         return value
 
@@ -85,11 +85,11 @@ class Value:
         """Return one array of shape `(count,)` for each number."""
         return [lanes.array(x, self.dtype) for x in self.numbers().ravel()]
 
-    def entering(self, lanes: Any) -> "Value":
+    def entering(self, lanes: Any) -> "LaneValue":
         """Return the value for the body of a loop. All operations on it are done before: results
         made inside are not known outside."""
         numbers = [lanes.emitted(x) for x in self.numbers().ravel()]
-        value = Value.of_numbers(object_array(numbers, self.shape), self.dtype)
+        value = LaneValue.of_numbers(object_array(numbers, self.shape), self.dtype)
         value._whole = self._whole
         return value
 
@@ -114,7 +114,7 @@ def _split(x: Any, shape: tuple[int, ...]) -> np.ndarray:
     return object_array([x[index] for index in np.ndindex(*shape)], shape)
 
 
-class Layout(NamedTuple):
+class ColumnLayout(NamedTuple):
     """The structure of a tree that is stored as columns."""
 
     treedef: Any
@@ -122,16 +122,16 @@ class Layout(NamedTuple):
     dtypes: tuple[np.dtype, ...]
 
     @staticmethod
-    def of(tree: Any) -> "Layout":
-        """Return the layout of a tree of [`Value`][]s, or of arrays of one trajectory."""
+    def of(tree: Any) -> "ColumnLayout":
+        """Return the layout of a tree of [`LaneValue`][]s, or of arrays of one trajectory."""
         leaves, treedef = jtu.tree_flatten(tree)
         dtypes = (np.dtype(x.dtype) for x in leaves)
-        return Layout(treedef, tuple(x.shape for x in leaves), tuple(dtypes))
+        return ColumnLayout(treedef, tuple(x.shape for x in leaves), tuple(dtypes))
 
     @staticmethod
-    def of_one(tree: Any) -> "Layout":
+    def of_one(tree: Any) -> "ColumnLayout":
         """Return the layout of one trajectory of arrays with the trajectories in front."""
-        return Layout.of(jtu.tree_map(lambda x: example(x.shape[1:], x.dtype), tree))
+        return ColumnLayout.of(jtu.tree_map(lambda x: example(x.shape[1:], x.dtype), tree))
 
     def dtypes_of_columns(self) -> list[np.dtype]:
         each = zip(self.shapes, self.dtypes, strict=True)
@@ -146,29 +146,29 @@ class Columns(eqx.Module):
     """A tree as a list of columns: one array for each number, over all lanes or all trajectories."""
 
     columns: list[jax.Array]
-    layout: Layout = eqx.field(static=True)
+    layout: ColumnLayout = eqx.field(static=True)
 
     @staticmethod
-    def zeros(layout: Layout, count: int) -> "Columns":
+    def zeros(layout: ColumnLayout, count: int) -> "Columns":
         return Columns([jnp.zeros(count, dtype) for dtype in layout.dtypes_of_columns()], layout)
 
     @staticmethod
     def of_values(tree: Any, lanes: Any) -> "Columns":
         columns = [column for value in jtu.tree_leaves(tree) for column in value.columns(lanes)]
-        return Columns(columns, Layout.of(tree))
+        return Columns(columns, ColumnLayout.of(tree))
 
     @staticmethod
     def of_arrays(tree: Any) -> "Columns":
         """Return the columns of arrays with the trajectories in front."""
         flat = lambda leaf: leaf.reshape(leaf.shape[0], math.prod(leaf.shape[1:]))
         columns = [column for leaf in jtu.tree_leaves(tree) for column in flat(leaf).T]
-        return Columns(columns, Layout.of_one(tree))
+        return Columns(columns, ColumnLayout.of_one(tree))
 
     def values(self) -> Any:
         out, k = [], 0
         for shape, dtype in zip(self.layout.shapes, self.layout.dtypes, strict=True):
             numbers = object_array(self.columns[k : k + math.prod(shape)], shape)
-            out.append(Value.of_numbers(numbers, dtype))
+            out.append(LaneValue.of_numbers(numbers, dtype))
             k += numbers.size
         return jtu.tree_unflatten(self.layout.treedef, out)
 
@@ -176,7 +176,7 @@ class Columns(eqx.Module):
         """Return arrays with the trajectories in front."""
         rows = self.columns[0].shape[0] if self.columns else 0
 
-        def array(value: Value) -> jax.Array:
+        def array(value: LaneValue) -> jax.Array:
             numbers = list(value.numbers().flat)
             found = jnp.stack(numbers, axis=1) if numbers else jnp.zeros(0, value.dtype)
             return found.reshape(rows, *value.shape)

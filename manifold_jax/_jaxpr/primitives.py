@@ -128,8 +128,7 @@ def sources(
 
 def arranged_factors(equation: Any, factors: Sequence[np.ndarray]) -> list[np.ndarray]:
     """Return the factors of a `dot_general` with their axes rearranged: one that both have in common,
-    one of the factor's own, one that is summed over, and trailing ones that arrays of numbers do not
-    have."""
+    one of the factor's own, one that is summed over, and trailing ones absent in arrays of numbers."""
     out = []
     axes = equation.params["dimension_numbers"]
     for variable, x, summed, batch in zip(equation.invars, factors, *axes, strict=True):

@@ -19,8 +19,7 @@ class AbstractLieGroup(eqx.Module):
 
     @abc.abstractmethod
     def tangent(self, y: Array, velocity: Float[Array, " d"]) -> Array:
-        r"""Return the velocity $y\,\xi$ of the state, like `y`: for fields that are known in the
-        algebra."""
+        r"""Return the velocity $y\,\xi$ of the state, like `y`, for fields known in the algebra."""
 
     @abc.abstractmethod
     def velocity(self, y: Array, tangent: Array) -> Float[Array, " d"]:

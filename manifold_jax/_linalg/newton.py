@@ -43,8 +43,7 @@ class AbstractEquations(eqx.Module):
 
 
 class SquareSystem(AbstractEquations):
-    """`function(z) = 0` for vectors, optionally with its matrix `dr/dz`. Both are pytrees of all that
-    they depend on."""
+    """`function(z) = 0` for vectors, optionally with its matrix `dr/dz`, both pytrees."""
 
     function: Callable
     matrix: Callable | None = None

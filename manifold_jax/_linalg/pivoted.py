@@ -52,16 +52,16 @@ def factorize_pivoted(
 ) -> Factorization:
     """Factor any matrix with row exchanges; one that is singular or not finite becomes the identity."""
     fixed, eye = jax.lax.stop_gradient(A), jnp.eye(A.shape[0], dtype=A.dtype)
-    factors, regular = (_eliminate if A.shape[0] <= largest_written_out else _lapack)(fixed)
-    return Factorization(jnp.where(regular, A, eye), factors, regular, multiply)
+    factors, nonsingular = (_eliminate if A.shape[0] <= largest_written_out else _lapack)(fixed)
+    return Factorization(jnp.where(nonsingular, A, eye), factors, nonsingular, multiply)
 
 
 def _lapack(A: Float[Array, "n n"]) -> tuple[Library, BoolScalar]:
     lu, pivots = jsl.lu_factor(A)
-    regular = jnp.all(jnp.isfinite(lu)) & jnp.all(jnp.diagonal(lu) != 0)
-    lu = jnp.where(regular, lu, jnp.eye(A.shape[0], dtype=A.dtype))
-    pivots = jnp.where(regular, pivots, jnp.arange(A.shape[0], dtype=pivots.dtype))
-    return Library((lu, pivots)), regular
+    nonsingular = jnp.all(jnp.isfinite(lu)) & jnp.all(jnp.diagonal(lu) != 0)
+    lu = jnp.where(nonsingular, lu, jnp.eye(A.shape[0], dtype=A.dtype))
+    pivots = jnp.where(nonsingular, pivots, jnp.arange(A.shape[0], dtype=pivots.dtype))
+    return Library((lu, pivots)), nonsingular
 
 
 def _eliminate(A: Float[Array, "n n"]) -> tuple[UnrolledElimination, BoolScalar]:
@@ -70,7 +70,7 @@ def _eliminate(A: Float[Array, "n n"]) -> tuple[UnrolledElimination, BoolScalar]
     n = A.shape[0]
     eye = jnp.eye(n, dtype=A.dtype)
     rows: list[list[Any]] = [list(A[i]) + list(eye[i]) for i in range(n)]
-    regular = jnp.asarray(True)
+    nonsingular = jnp.asarray(True)
     for k in range(n):
         for i in range(k + 1, n):
             larger = jnp.abs(rows[i][k]) > jnp.abs(rows[k][k])
@@ -79,16 +79,16 @@ def _eliminate(A: Float[Array, "n n"]) -> tuple[UnrolledElimination, BoolScalar]
                 rows[k][j], rows[i][j] = jnp.where(larger, b, a), jnp.where(larger, a, b)
         pivot = rows[k][k]
         accepted = (pivot != 0) & jnp.isfinite(pivot)
-        regular &= accepted
+        nonsingular &= accepted
         rows[k][k] = 1 / jnp.where(accepted, pivot, 1)
         for i in range(k + 1, n):
             factor = rows[i][k] * rows[k][k]
             for j in range(k + 1, 2 * n):
                 rows[i][j] = rows[i][j] - factor * rows[k][j]
     # A singular matrix is replaced by the identity.
-    U = [[jnp.where(regular, rows[i][j], float(i == j)) for j in range(n)] for i in range(n)]
-    E = jnp.where(regular, jnp.stack([jnp.stack(row[n:]) for row in rows]), eye)
-    return UnrolledElimination(U, E), regular
+    U = [[jnp.where(nonsingular, rows[i][j], float(i == j)) for j in range(n)] for i in range(n)]
+    E = jnp.where(nonsingular, jnp.stack([jnp.stack(row[n:]) for row in rows]), eye)
+    return UnrolledElimination(U, E), nonsingular
 
 
 class InverseFactor(eqx.Module):

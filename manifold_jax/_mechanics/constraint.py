@@ -15,7 +15,7 @@ from .._constraint.projection_info import ProjectionInfo
 from .._constraint.residual import as_time, residual_vector
 from .._linalg.rows import multiply
 from .._linalg.sparse import Choice, Structure, structure_of
-from .correction import InverseMetrics, TwoStages
+from .correction import InverseMetrics, PositionVelocityCorrection
 from .kinematics import flat, Kinematics
 
 
@@ -55,14 +55,16 @@ class MechanicalConstraint(AbstractConstraint):
         x, _ = jfu.ravel_pytree(y)
         here = Kinematics.of(self, t, y, args)
         here = here if directions is None else here.dense()
-        stages = TwoStages(here, projection, InverseMetrics.of(projection, y), directions)
-        corrected, roots = stages.correct(fallback, far)
+        metrics = InverseMetrics.of(projection, y)
+        correction = PositionVelocityCorrection(here, projection, metrics, directions)
+        corrected, roots = correction.correct(fallback, far)
         return corrected, ProjectionInfo.of_correction(x, *roots)
 
     def normals(self, projection, t, y, args=None) -> ConstraintNormals:
         here = Kinematics.of(self, t, y, args).dense()
         metrics = InverseMetrics.of(projection, y)
-        return TwoStages(here, projection, metrics, None).normals(here.x, here.w).normals
+        correction = PositionVelocityCorrection(here, projection, metrics, None)
+        return correction.normals(here.x, here.w).normals
 
     def structure_at(self, t, y, args=None) -> Structure | None:
         return whole_structure(self, t, y, args) if self.is_sparse(t, y, args) else None

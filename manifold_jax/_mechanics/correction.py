@@ -6,8 +6,7 @@ with `C` the Jacobian of all constraints with respect to the velocities, whose f
 `J = dphi/dq`, and one factorization of `C V` for both. The velocities are corrected at the
 corrected positions. Neither needs the derivative of `J v`, half of the full Jacobian.
 
-Source: Eich, SIAM J. Numer. Anal. 30 (1993) 1467-1482; Lubich, Nowak, Poehle & Engstler,
-MEXX (1992).
+Source: Eich, SIAM J. Numer. Anal. 30 (1993) 1467-1482; Lubich, Nowak, Poehle & Engstler, MEXX (1992).
 """
 
 import dataclasses
@@ -49,7 +48,7 @@ class InverseMetrics(NamedTuple):
         return InverseMetrics(diagonal[:k], diagonal[k:])
 
 
-class TwoStages(NamedTuple):
+class PositionVelocityCorrection(NamedTuple):
     """The correction of a state; `directions` are `V^T` if they are not those of the state itself."""
 
     here: Kinematics

@@ -50,7 +50,7 @@ class LagrangianForce(eqx.Module):
 _LARGEST_RESIDUAL = 0.05
 
 
-class Motion:
+class EquationsOfMotion:
     """The quantities of the equations of motion at one state: `C a = -bias`, the mass matrix, and
     `C M^-1 C^T`, factored."""
 
@@ -123,8 +123,8 @@ def _agree(C: Float[Array, "m n"], a: Float[Array, " n"], bias: Float[Array, " m
     sizes = jnp.abs(C)
     own = sizes @ jnp.abs(a) + jnp.abs(bias)
     # For rows without motion, e.g. across the plane of a planar mechanism in space.
-    any = jnp.max(sizes, axis=1) * jnp.max(jnp.abs(a)) + jnp.max(jnp.abs(bias))
-    return jnp.all(jnp.abs(C @ a + bias) <= _LARGEST_RESIDUAL * (own + 0.02 * any))
+    largest = jnp.max(sizes, axis=1) * jnp.max(jnp.abs(a)) + jnp.max(jnp.abs(bias))
+    return jnp.all(jnp.abs(C @ a + bias) <= _LARGEST_RESIDUAL * (own + 0.02 * largest))
 
 
 def _flat_force(force: Any, q: Y, x: Float[Array, " n"]) -> Float[Array, " n"]:

@@ -19,7 +19,7 @@ from .._solver.terms import DirectedTerm
 from .auxiliary import ExtendedConstraint
 from .constraint import MechanicalConstraint
 from .mass import ConfigurationMass, LagrangianMass
-from .motion import LagrangianForce, Motion
+from .motion import EquationsOfMotion, LagrangianForce
 from .stabilization import Baumgarte, VelocityStabilization
 
 
@@ -211,7 +211,7 @@ class MechanicalSystem(eqx.Module):
 
     def accelerations(self, t: RealScalarLike, y: Y, args: Args = None) -> Y:
         """Return `a` of `M a + J^T lambda = Q`, like `q`, without stabilization."""
-        motion = Motion(self, t, y, args)
+        motion = EquationsOfMotion(self, t, y, args)
         return motion.unravel(motion.solve(motion.bias)[0])
 
     def multipliers(self, t: RealScalarLike, y: Y, args: Args = None) -> Float[Array, " m"]:
@@ -219,11 +219,11 @@ class MechanicalSystem(eqx.Module):
         of `ravel_pytree`, then those of `velocity_constraint`. The constraint force on the coordinates
         is `-J^T lambda`. With `redundant=True` the solution with the least forces: the sum of
         `lambda_i^2 (J M^-1 J^T)_ii` is minimal."""
-        motion = Motion(self, t, y, args)
+        motion = EquationsOfMotion(self, t, y, args)
         return motion.solve(motion.bias)[1]
 
     def _field(self, t: RealScalarLike, y: Y, args: Args) -> Y:
-        motion = Motion(self, t, y, args)
+        motion = EquationsOfMotion(self, t, y, args)
         a, _ = motion.solve(motion.bias)
         velocity = y[1]
         if isinstance(self.stabilization, VelocityStabilization):
@@ -243,7 +243,7 @@ class MechanicalSystem(eqx.Module):
     def _stabilized_field(self, t: RealScalarLike, y: Y, args: Args) -> tuple[Y, Y]:
         """Return the field, and the part of it that changes sign with the direction of time."""
         assert isinstance(self.stabilization, Baumgarte)
-        motion = Motion(self, t, y, args)
+        motion = EquationsOfMotion(self, t, y, args)
         alpha, beta = self.stabilization.alpha, self.stabilization.beta
         rate, p = motion.here.velocities(), motion.num_positions
         a, _ = motion.solve(motion.bias.at[:p].add(beta**2 * motion.here.positions()))

@@ -119,8 +119,7 @@ class Assembly(eqx.Module):
         **Arguments:**
 
         - `positions`, `velocities` of centres of mass; `orientations`, as for [`Body`][];
-            `angular_velocities` (rad/s), a number, or in space shape `(3,)`, in world
-            coordinates.
+            `angular_velocities` (rad/s), a number, or in space shape `(3,)`, in world coordinates.
         - `assemble`: keep the given values, and find the rest such that all joints are satisfied: the
             nearest to the drawing, and the slowest. Also inside `jit`, `vmap` and derivatives, with
             respect to lengths and given values; joints that cannot be closed are then an error at

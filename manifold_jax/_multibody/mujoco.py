@@ -27,8 +27,7 @@ def from_mujoco(
     ignore: Sequence[str] = (),
     redundant: bool = False,
 ) -> Assembly:
-    """The assembly of an MJCF or URDF file, by MuJoCo's parser (`pip install
-    "manifold_jax[mjcf]"`).
+    """The assembly of an MJCF or URDF file, by MuJoCo's parser (`pip install "manifold_jax[mjcf]"`).
 
     Joints are exact here, also those that MuJoCo keeps by soft constraints (`equality`): its
     `solref`, `solimp` and its integrator play no part.

@@ -42,12 +42,12 @@ def make_state(
     known = all(is_concrete(leaf) for leaf in jtu.tree_leaves((y, assembly, t, args)))
     if not known and not assemble:
         return y
-    closing = Closing(assembly, y, kept, t, args)
+    closure = LoopClosure(assembly, y, kept, t, args)
     if not known:
-        return closing.assembled_when_run()
+        return closure.assembled_when_run()
     if assemble:
-        y = closing.assembled()
-    closing.check(y)
+        y = closure.assembled()
+    closure.check(y)
     return y
 
 
@@ -75,21 +75,21 @@ def _with_given(
 
 
 def _place(
-    bodies: Any, rows: Any, words: Any, what: str, checked: Callable
+    bodies: Any, rows: Any, by_name: Any, what: str, checked: Callable
 ) -> tuple[Array, np.ndarray]:
     """Return the rows, those that are given by name replaced, and which are given."""
-    words = {} if words is None else words
-    if not isinstance(words, dict):
-        raise TypeError(f"`{what}` must be a dictionary of names of bodies, got {words!r}.")
+    by_name = {} if by_name is None else by_name
+    if not isinstance(by_name, dict):
+        raise TypeError(f"`{what}` must be a dictionary of names of bodies, got {by_name!r}.")
     has = np.zeros(len(bodies.names), bool)
     rows = list(on_host(rows))
-    for name, value in words.items():
+    for name, value in by_name.items():
         i = bodies.moving_index(name, f"`{what}`")
         rows[i], has[i] = checked(f"`{what}` of {name!r}", value), True
     return stack(rows), has
 
 
-class Closing:
+class LoopClosure:
     """Closes the loops of an assembly: its equations as functions of the vector `x` of all coordinates,
     and the state `x`, `w`, of which `free_x`, `free_w` may be moved."""
 

@@ -44,7 +44,7 @@ _FAULTS = (
 INCONSISTENT = 3
 
 
-class Linearized(NamedTuple):
+class LinearizedEquations(NamedTuple):
     """The equations linearized at one time and state.
 
     - `derivative`: `y'`.
@@ -54,7 +54,7 @@ class Linearized(NamedTuple):
     - `residual`: the largest residual of an algebraic equation, relative to its change when the unknowns
         change by `|x| + 1`. Rounding of the state leaves a few units of it, but far more of `newton` where
         equations are badly conditioned.
-    - `finite`, `regular`: whether the equations are defined there, and of index 1.
+    - `finite`, `nonsingular`: whether the equations are defined there, and of index 1.
     """
 
     derivative: Float[Array, " n"]
@@ -62,16 +62,16 @@ class Linearized(NamedTuple):
     kept: Callable[[Float[Array, " n"]], Float[Array, " n"]]
     residual: FloatScalar
     finite: BoolScalar
-    regular: BoolScalar
+    nonsingular: BoolScalar
 
 
-class Equations(NamedTuple):
+class MassMatrixEquations(NamedTuple):
     """`field(t, x)` and `mass(t, x)`, a scalar, a diagonal or a matrix."""
 
     field: Callable[[RealScalarLike, Float[Array, " n"]], Float[Array, " n"]]
     mass: Callable[[RealScalarLike, Float[Array, " n"]], Float[Array, "..."]]
 
-    def at(self, t: RealScalarLike, x: Float[Array, " n"]) -> Linearized:
+    def at(self, t: RealScalarLike, x: Float[Array, " n"]) -> LinearizedEquations:
         f, M = self.field(t, x), as_matrix(self.mass(t, x), x.size)
         size = jax.lax.stop_gradient(jnp.max(jnp.abs(M), axis=1))
         D = jnp.where(size > 0, 1 / jnp.where(size > 0, size, 1), 1)
@@ -89,17 +89,17 @@ class Equations(NamedTuple):
         s = jnp.where(largest > 0, 1 / jnp.where(largest > 0, largest, 1), 1)
         A = M + s * K
         finite = jnp.all(jnp.isfinite(A)) & jnp.all(jnp.isfinite(f)) & jnp.all(jnp.isfinite(Kt))
-        regular = finite & _is_regular(jax.lax.stop_gradient(A))
-        factor = factorize_pivoted(jnp.where(regular, A, jnp.eye(x.size, dtype=A.dtype)))
-        nan = jnp.where(regular, 0.0, jnp.nan).astype(x.dtype)
+        nonsingular = finite & _is_nonsingular(jax.lax.stop_gradient(A))
+        factor = factorize_pivoted(jnp.where(nonsingular, A, jnp.eye(x.size, dtype=A.dtype)))
+        nan = jnp.where(nonsingular, 0.0, jnp.nan).astype(x.dtype)
         r = P @ (D * f)
-        return Linearized(
+        return LinearizedEquations(
             factor.solve(M @ z - s * Kt) + nan,
             -factor.solve(s * r) + nan,
             lambda change: factor.solve(M @ change),
             _relative_residual(*jax.lax.stop_gradient((r, K, x))) + nan,
             finite,
-            regular,
+            nonsingular,
         )
 
 
@@ -126,7 +126,7 @@ def _null_space(
     return inverse, jnp.where(jnp.abs(P) > 100 * unit, P, 0)
 
 
-def _is_regular(A: Float[Array, "n n"]) -> BoolScalar:
+def _is_nonsingular(A: Float[Array, "n n"]) -> BoolScalar:
     """Whether `A` is nonsingular, whatever the units of equations and unknowns."""
     A = jnp.where(jnp.all(jnp.isfinite(A)), A, 0)
     for axis in (1, 0):
@@ -147,8 +147,8 @@ def relative_size(change: Float[Array, " n"], x: Float[Array, " n"]) -> FloatSca
     return jnp.max(jnp.abs(change) / (jnp.abs(x) + 1), initial=0.0)
 
 
-def is_consistent(x: Float[Array, " n"], linearized: Linearized) -> BoolScalar:
-    return linearized.regular & is_small(relative_size(linearized.newton, x))
+def is_consistent(x: Float[Array, " n"], linearized: LinearizedEquations) -> BoolScalar:
+    return linearized.nonsingular & is_small(relative_size(linearized.newton, x))
 
 
 def is_small(correction: FloatScalar) -> BoolScalar:
@@ -164,11 +164,11 @@ class _Iterate(NamedTuple):
     residual: FloatScalar
     iterations: IntScalar
     finite: BoolScalar  # whether the equations are defined at the start
-    regular: BoolScalar
+    nonsingular: BoolScalar
 
 
 def consistent(
-    equations: Equations, t: RealScalarLike, x: Float[Array, " n"]
+    equations: MassMatrixEquations, t: RealScalarLike, x: Float[Array, " n"]
 ) -> tuple[Float[Array, " n"], ProjectionInfo]:
     """Return `x` with the part corrected that `M` does not determine; `x` itself if that fails.
 
@@ -192,7 +192,7 @@ def consistent(
             linearized.residual,
             i.iterations + 1,
             jnp.where(at_start, linearized.finite, i.finite),
-            jnp.where(at_start, linearized.regular, i.regular),
+            jnp.where(at_start, linearized.nonsingular, i.nonsingular),
         )
 
     unknown, yes = jnp.asarray(jnp.inf, x.dtype), jnp.asarray(True)
@@ -214,7 +214,7 @@ def consistent(
         iterations=end.iterations,
         residual=jnp.where(end.finite, jnp.where(jnp.isnan(end.size), jnp.inf, end.size), jnp.nan),
         correction=relative_size(moved - fixed, fixed),
-        full_rank=end.regular,
+        full_rank=end.nonsingular,
         success=success,
     )
     return out, info

@@ -18,7 +18,7 @@ from .._base.user_functions import check_function
 from .._constraint.checks import check_state
 from .._constraint.diagnosis import Diagnosis
 from .._constraint.projection_info import ProjectionInfo
-from .algebraic import consistent, Equations, faults_of_start
+from .algebraic import consistent, faults_of_start, MassMatrixEquations
 
 
 class MassMatrixTerm(dfx.AbstractTerm):
@@ -30,7 +30,7 @@ class MassMatrixTerm(dfx.AbstractTerm):
 
     The left null space of `M` says which equations are algebraic: $u^T M = 0$ leaves
     $0 = u^T f(t, y)$. The index is 1 where these equations determine the part of `y` that `M` does
-    not see: where $M + P\, \partial f/\partial y$ is regular, with `P` the projector onto that null
+    not see: where $M + P\, \partial f/\partial y$ is nonsingular, with `P` the projector onto that null
     space. With a higher index (mechanics with constraints on positions, constraints of optimal
     control) reduce it first, for example with `mj.reduce_dae`.
 
@@ -38,10 +38,9 @@ class MassMatrixTerm(dfx.AbstractTerm):
 
     - `vector_field`: `f(t, y, args)`, of the structure of `y`. In an algebraic equation it is what
         has to be zero.
-    - `mass`: the matrix, or a callable `M(t, y, args)` that returns it: a scalar, the diagonal
-        (shape `(n,)`, or a pytree with the structure and shapes of `y`), or a matrix of shape
-        `(n, n)`, for the `n` numbers of `y` in the order of `jax.flatten_util.ravel_pytree`. Of
-        constant rank.
+    - `mass`: the matrix, or a callable `M(t, y, args)` that returns it: a scalar, the diagonal (shape
+        `(n,)`, or a pytree with the structure and shapes of `y`), or a matrix of shape `(n, n)`, for
+        the `n` numbers of `y` in the order of `jax.flatten_util.ravel_pytree`. Of constant rank.
 
     The initial value has to satisfy the algebraic equations. [`mj.diffeqsolve`][] sees to that
     (`consistent="project"` changes only what `M` does not see, `"check"` refuses); with
@@ -107,14 +106,14 @@ class MassMatrixTerm(dfx.AbstractTerm):
         x, unravel = jfu.ravel_pytree(y)
         return unravel(self.equations(y, args).at(t, x).derivative)
 
-    def equations(self, y: Y, args: Args) -> Equations:
+    def equations(self, y: Y, args: Args) -> MassMatrixEquations:
         """Return the equations in the vector of all numbers of the state; `y` is an example of a state."""
         _, unravel = jfu.ravel_pytree(y)
 
         def field(t: RealScalarLike, x: Float[Array, " n"]) -> Float[Array, " n"]:
             return ravelled_like(y, self.vector_field(t, unravel(x), args))
 
-        return Equations(field, lambda t, x: mass_values(self.mass, t, unravel(x), args))
+        return MassMatrixEquations(field, lambda t, x: mass_values(self.mass, t, unravel(x), args))
 
 
 @clear_errors

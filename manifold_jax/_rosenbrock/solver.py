@@ -108,7 +108,7 @@ class AbstractRosenbrock(dfx.AbstractAdaptiveSolver):
         step = rosenbrock_step(self.tableau, system, x0, derivative, self.largest_written_out)
         finite = jnp.all(jnp.isfinite(step.x1)) & jnp.all(jnp.isfinite(step.error))
         result = RESULTS.where(finite, RESULTS.successful, RESULTS.nonfinite)  # pyright: ignore[reportArgumentType]
-        singular = step.defined & ~step.regular | ~solver_state.usable
+        singular = step.defined & ~step.nonsingular | ~solver_state.usable
         result = RESULTS.where(singular, nonlinear_failure(), result)
         # A smaller step does not help if the equations are not defined at its beginning.
         repeatable = is_repeatable(t0, t1, solver_state.first_step)

@@ -32,7 +32,7 @@ class RosenbrockStep(NamedTuple):
     dense: tuple[Vector, ...]
     derivative: Vector | None
     defined: BoolScalar
-    regular: BoolScalar
+    nonsingular: BoolScalar
 
 
 def rosenbrock_step(

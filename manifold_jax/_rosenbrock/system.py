@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 from .._base.compat import directed, time_direction, undirected
 from .._base.types import Args, RealScalarLike, Y
 from .._linalg.rows import product
-from .algebraic import Linearized
+from .algebraic import LinearizedEquations
 from .mass_matrix import mass_values, MassMatrixTerm, ravelled_like
 
 
@@ -77,7 +77,7 @@ class System(NamedTuple):
         _, T = jax.jvp(lambda t: rest(t, x0)[0], (t0,), (self.step.astype(t0.dtype),))
         return f0, J, T
 
-    def at_start(self, x0: Vector) -> tuple[Linearized, Vector]:
+    def at_start(self, x0: Vector) -> tuple[LinearizedEquations, Vector]:
         """Return the equations and the mass matrix at the beginning, and `y'` in the step's direction."""
         direction = time_direction(self.terms)
         at = self.mass.equations(self.y0, self.args).at(self.t0 * direction, x0)  # pyright: ignore

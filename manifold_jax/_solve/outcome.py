@@ -16,7 +16,7 @@ from .._constraint.settings import NewtonProjection
 from .._rosenbrock import AbstractRosenbrock
 from .._solver import Projected
 from .._solver.base import AbstractManifoldSolver
-from .._solver.step.advance import StepStatistics
+from .._solver.step.hook_state import StepStatistics
 
 
 _NOT_CORRECTED = (

@@ -12,8 +12,8 @@ from .._constraint.checks import check_constraint, check_state
 from .._constraint.constraint import NoConstraint
 from .._rosenbrock import AbstractRosenbrock, MassMatrixTerm
 from .._solver.base import AbstractManifoldSolver, controller_tolerances
-from .._solver.step.advance import HookState
 from .._solver.step.execution import ExplicitStep
+from .._solver.step.hook_state import HookState
 from .._solver.terms import DirectedTerm
 from .._solver.unconstrained import Unconstrained
 from .first_step import first_step, FirstStep

@@ -17,9 +17,9 @@ from .._constraint.projection_info import ProjectionInfo
 from .._constraint.settings import NewtonProjection
 from .._rosenbrock import AbstractRosenbrock, MassMatrixTerm
 from .interpolation import CorrectedInterpolationFactory
-from .step.advance import conclude, HookState
 from .step.execution import AbstractExecution, execution_of
 from .step.frame import StepFrame
+from .step.hook_state import conclude, HookState
 
 
 # One-step methods that keep no past values of y. Others (leapfrog, reversible) carry a

@@ -81,6 +81,5 @@ def _lengthened(x: Array, missing: int, mesh: Mesh) -> Array:
 
 
 def _on_all(x: Array, mesh: Mesh) -> Array:
-    """Replicate arrays whose leading axis does not divide among the devices, instead of sending them
-    around piece by piece."""
+    """Replicate arrays that cannot be shared equally, instead of sending them around piece by piece."""
     return jax.lax.with_sharding_constraint(x, NamedSharding(mesh, PartitionSpec()))

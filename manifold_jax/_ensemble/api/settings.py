@@ -18,11 +18,11 @@ _IN_PROGRAM = ("sample", "terms", "solver", "t0", "t1", "dt0", "saveat", "stepsi
 
 def settings_of(given: dict[str, Any], program: str) -> dict[str, Any]:
     """Return the settings as JSON values. `program` is the traced program before compilation."""
-    words = {name: _described(value) for name, value in given.items()}
+    described = {name: _described(value) for name, value in given.items()}
     device = jax.devices()[0]
     versions = {f"version of {name}": version(name) for name in _PACKAGES}
     return {
-        **words,
+        **described,
         "device": f"{device.platform}, {device.device_kind}",
         "x64": bool(jax.config.read("jax_enable_x64")),
         **versions,

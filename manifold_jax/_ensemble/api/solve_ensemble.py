@@ -30,7 +30,7 @@ from ..lanes.arguments import (
 from ..lanes.execution import solve_on_one_device
 from ..lanes.parts import Inputs
 from ..lanes.solution import EnsembleSolution, messages_of
-from ..lanes.trajectory import Equations
+from ..lanes.trajectory import LaneEquations
 from .devices import check_mesh, over_devices
 
 
@@ -114,7 +114,7 @@ def solve_ensemble(
     one = jax.eval_shape(batch.one)
     warn_of_rounding(one.y0, batch.dtype, stepsize_controller)
     solver = without_idle_hook(solver, one.t0, one.y0, one.args)
-    equations = Equations(
+    equations = LaneEquations(
         terms, solver, stepsize_controller, saveat, dt0, adjoint, max_steps, lanes, consistent
     )
 

@@ -30,7 +30,7 @@ from ..stored.arrays import (
 from ..stored.faults import faults_of_chunks, faults_of_descriptions, finished_chunks
 from ..stored.lock import LOCK_FILE, only_writer
 from ..stored.store import stored_at, StoredEnsemble
-from .progress import Meter
+from .progress import ChunkMeter
 from .sampling import drawn
 from .settings import check_settings, settings_of
 from .solve_ensemble import DEFAULT_LANES, solve_ensemble
@@ -154,7 +154,7 @@ def _compute(stored: StoredEnsemble, lowered: Any, call: Callable, progress: boo
     count = lambda start: min(chunk, size - start)
     finished = size - sum(map(count, starts))
     failed = sum(np.count_nonzero(stored.result[k * chunk : (k + 1) * chunk]) for k in whole)
-    with Meter(size, finished, int(failed), progress) as meter:
+    with ChunkMeter(size, finished, int(failed), progress) as meter:
         if starts:
             meter.compiling()
             program = lowered.compile()

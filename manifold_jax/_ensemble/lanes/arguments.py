@@ -15,7 +15,7 @@ from ..._base.types import Args, Y
 from ..._constraint.checks import check_state
 from ..._solve.prepare import time_dtype
 from ..._solve.times import is_no_step, NO_FIRST_STEP, NO_OUTPUT_TIME
-from .trajectory import end_floor, Given
+from .trajectory import end_floor, TrajectoryData
 
 
 # Names of the axes of a mesh over which trajectories are distributed; none on one device.
@@ -33,20 +33,20 @@ def anywhere(x: Array, axes: Axes) -> Array:
 
 
 class Batch(eqx.Module):
-    """The fields of [`Given`][], split into leaves with the trajectories in front, and common ones."""
+    """The fields of [`TrajectoryData`][], split into leaves with the trajectories in front, and common ones."""
 
     each: Any
     common: Any
     dtype: Any = eqx.field(static=True)
     size: int = eqx.field(static=True)
 
-    def complete(self, each: Any) -> Given:
+    def complete(self, each: Any) -> TrajectoryData:
         """Return the arguments of one trajectory, from its part of `each`."""
         given = eqx.combine(each, self.common)
         t0, t1 = jnp.asarray(given.t0, self.dtype), jnp.asarray(given.t1, self.dtype)
         return given._replace(t0=t0, t1=t1)
 
-    def one(self) -> Given:
+    def one(self) -> TrajectoryData:
         """Return an example."""
         return self.complete(jtu.tree_map(lambda x: x[0], self.each))
 
@@ -61,8 +61,8 @@ def checked_batch(
     y0s = jtu.tree_map(jnp.asarray, y0s)
     timed = tuple(eqx.is_array(t) and t.ndim > 0 for t in (t0, t1))
     axes = jtu.tree_map(lambda _: True, y0s), _axes(args_axes, args)
-    mask = Given._make((*timed, *axes, any(timed)))
-    own = eqx.filter(Given._make((t0, t1, y0s, args, None)), mask)
+    mask = TrajectoryData._make((*timed, *axes, any(timed)))
+    own = eqx.filter(TrajectoryData._make((t0, t1, y0s, args, None)), mask)
     parts = {"y0s": own.y0, "t0": own.t0, "t1": own.t1, "args": own.args}
     leaves = [(name, x) for name in parts for x in jtu.tree_leaves_with_path(parts[name])]
     sizes = {f"{name}{jtu.keystr(path)}": _size(x) for name, (path, x) in leaves}
@@ -70,7 +70,7 @@ def checked_batch(
     start, end = (t if np.ndim(t) == 0 else t[0] for t in (t0, t1))
     dtype = time_dtype(start, end, dt0, saveat)
     floor = end_floor(jnp.asarray(t0, dtype), jnp.asarray(t1, dtype))
-    each, common = eqx.partition(Given(t0, t1, y0s, args, floor), mask)
+    each, common = eqx.partition(TrajectoryData(t0, t1, y0s, args, floor), mask)
     return Batch(each, common, dtype, next(iter(sizes.values())))  # pyright: ignore[reportArgumentType, reportCallIssue]
 
 
@@ -95,8 +95,8 @@ def checked_times(saveat: dfx.SaveAt, batch: Batch, axes: Axes) -> dfx.SaveAt:
         t0, t1 = _ends(batch)
         direction = jnp.where(t0 < t1, 1, -1).astype(ts.dtype)[:, None]
         ahead = ts[None] * direction
-        before, behind = t0[:, None] * direction, t1[:, None] * direction
-        outside = anywhere((ahead < before) | (ahead > behind), axes)
+        start, end = t0[:, None] * direction, t1[:, None] * direction
+        outside = anywhere((ahead < start) | (ahead > end), axes)
         unsorted = anywhere(ahead[:, 1:] < ahead[:, :-1], axes)
         ts = eqx.error_if(ts, jnp.isnan(ts), NO_OUTPUT_TIME)
         ts = eqx.error_if(ts, unsorted, "`saveat.ts` must be sorted from t0 to t1.")

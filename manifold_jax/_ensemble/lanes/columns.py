@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 
-from ..._jaxpr.lane_value import Columns, Layout
+from ..._jaxpr.lane_value import ColumnLayout, Columns
 
 
 def taken(tree: Any, index: jax.Array) -> Any:
@@ -23,7 +23,7 @@ class Stacked(eqx.Module):
     """Columns stacked into one array for each dtype; further leading axes hold many of them."""
 
     arrays: dict[str, jax.Array]
-    layout: Layout = eqx.field(static=True)
+    layout: ColumnLayout = eqx.field(static=True)
 
     @staticmethod
     def of(columns: Columns) -> "Stacked":
@@ -44,7 +44,7 @@ def unknown(dtype: Any) -> Any:
     return np.inf if jnp.issubdtype(dtype, jnp.floating) else 0
 
 
-def empty_table(layout: Layout, rows: int) -> Stacked:
+def empty_table(layout: ColumnLayout, rows: int) -> Stacked:
     """Return a table of `rows` trees, one row of each array per tree."""
     dtypes = [str(dtype) for dtype in layout.dtypes_of_columns()]
     full = lambda dtype: jnp.full((rows, dtypes.count(dtype)), unknown(dtype), dtype)

@@ -13,7 +13,7 @@ from .functions import begin, save, smooth_part, step_state
 from .parts import in_steps, Inputs, Parts
 from .rows import like, smooth_rows
 from .schedule import Schedule
-from .trajectory import Attempt, Equations, Given, Outcome, Start, Trajectory
+from .trajectory import Attempt, LaneEquations, LaneOutcome, LaneStart, Trajectory, TrajectoryData
 
 
 class GivenTangent(NamedTuple):
@@ -22,8 +22,8 @@ class GivenTangent(NamedTuple):
     each: Any
     rest: Any
     tangent: Any
-    equations: Equations
-    given: Given
+    equations: LaneEquations
+    given: TrajectoryData
 
     @property
     def direction(self) -> FloatScalar:
@@ -38,7 +38,7 @@ class Moving(NamedTuple):
 
 
 class Tangents:
-    """The methods of [`Equations`][] for pairs of a value and its tangent, with the same steps."""
+    """The methods of [`LaneEquations`][] for pairs of a value and its tangent, with the same steps."""
 
     def __init__(self, parts: Parts, common_tangent: Any):
         self.parts, self.common_tangent = parts, common_tangent
@@ -54,7 +54,7 @@ class Tangents:
         at, along = (given.each, self.parts.common, x), (given.tangent, self.common_tangent, dx)
         return jax.jvp(self.parts.smooth(function, given.rest, *args), at, along, has_aux=True)
 
-    def begin(self, given: GivenTangent) -> Start:
+    def begin(self, given: GivenTangent) -> LaneStart:
         _, tangent, start = self._along(begin, given, None, None)
         return start._replace(trajectory=Moving(start.trajectory, tangent))
 
@@ -65,7 +65,7 @@ class Tangents:
         before = moving.trajectory
         smooth, discrete = eqx.partition(step_state(before), eqx.is_inexact_array)
 
-        def attempt(equations: Equations, given: Given, smooth: Any) -> Any:
+        def attempt(equations: LaneEquations, given: TrajectoryData, smooth: Any) -> Any:
             y, memory = eqx.combine(smooth, discrete)
             state = with_memory(before.solver_state, memory)
             tried = equations.attempt(given, before._replace(y=y, solver_state=state))
@@ -90,7 +90,7 @@ class Tangents:
         _, tangent, (value, success) = self._along(save, given, *y, t)
         return (value, tangent), success
 
-    def outcome(self, given: GivenTangent, moving: Moving) -> tuple[Outcome, Any]:
+    def outcome(self, given: GivenTangent, moving: Moving) -> tuple[LaneOutcome, Any]:
         return given.equations.outcome(given.given, moving.trajectory), moving.tangent.y
 
 

@@ -11,7 +11,7 @@ import equinox as eqx
 from ..._adjoint.replay import memory_of, Solve, State
 from ..._base.compat import directed
 from ..._base.types import FloatScalar
-from .trajectory import Equations, Given, Trajectory
+from .trajectory import LaneEquations, Trajectory, TrajectoryData
 
 
 def step_state(trajectory: Trajectory) -> State:
@@ -24,14 +24,19 @@ def smooth_part(tree: Any) -> Any:
     return eqx.filter(tree, eqx.is_inexact_array)
 
 
-def begin(equations: Equations, given: Given, x: None) -> tuple[Any, Any]:
+def begin(equations: LaneEquations, given: TrajectoryData, x: None) -> tuple[Any, Any]:
     """Return the state before the first step; and the start."""
     start = equations.begin(given)
     return smooth_part(step_state(start.trajectory)), start
 
 
 def step(
-    equations: Equations, given: Given, smooth: State, rest: State, solver_state: Any, *ends: Any
+    equations: LaneEquations,
+    given: TrajectoryData,
+    smooth: State,
+    rest: State,
+    solver_state: Any,
+    *ends: Any,
 ) -> tuple[Any, Any]:
     """Return the state after a step and the data of its interpolation; and these data. `solver_state`
     is an example, for the parts that are not in the solver's memory."""
@@ -42,8 +47,8 @@ def step(
 
 
 def interpolate(
-    equations: Equations,
-    given: Given,
+    equations: LaneEquations,
+    given: TrajectoryData,
     dense_info: Any,
     t: FloatScalar,
     start: FloatScalar,
@@ -53,7 +58,9 @@ def interpolate(
     return equations.interpolated(t, start, end, dense_info), None
 
 
-def save(equations: Equations, given: Given, y: Any, t: FloatScalar) -> tuple[Any, Any]:
+def save(
+    equations: LaneEquations, given: TrajectoryData, y: Any, t: FloatScalar
+) -> tuple[Any, Any]:
     """Return the saved value of a state at time `t`; and whether it is on the manifold."""
     value, success = equations.saved_value(given, t, y)
     return smooth_part(value), (value, success)

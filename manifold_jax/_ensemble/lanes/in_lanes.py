@@ -21,10 +21,10 @@ from ..._solver.unconstrained import Unconstrained
 from .forward import tangents_in_lanes
 from .mapped import gradient_of_mapped, tangents_of_mapped
 from .parts import in_steps, Inputs, Parts, times_are_differentiated
-from .records import Ends
-from .reverse import ReverseSweep
+from .records import LaneEnds
+from .reverse import LaneReverseSweep
 from .rows import saved_rows, smooth_rows
-from .schedule import Run, Schedule
+from .schedule import LaneRun, Schedule
 from .solution import EnsembleSolution
 
 
@@ -33,7 +33,7 @@ _MOST_IN_COMMON = 200
 
 
 def gradient_in_lanes(
-    inputs: Inputs, differentiated: Any, run: Run, bar: Any, limit: int
+    inputs: Inputs, differentiated: Any, run: LaneRun, bar: Any, limit: int
 ) -> Inputs:
     """Return the gradient from `bar`, the cotangents of times and values."""
     parts = Parts.of(inputs, differentiated)
@@ -43,8 +43,8 @@ def gradient_in_lanes(
     at = parts.each, parts.common, run.start.trajectory.y, run.outcome.y, smooth
     values, pullback = jax.vjp(saved, *at)
     each, common, *bars = pullback(with_zeros(values, bar))
-    ends = Ends(run.start.trajectory, run.outcome.num_steps, run.rows, run.states, *bars)
-    more = ReverseSweep(parts, ends, limit).run()
+    ends = LaneEnds(run.start.trajectory, run.outcome.num_steps, run.rows, run.states, *bars)
+    more = LaneReverseSweep(parts, ends, limit).run()
     each, common = jtu.tree_map(jnp.add, (each, common), more)
     return common._replace(batch=dataclasses.replace(common.batch, each=each))
 
@@ -62,7 +62,7 @@ def solve_in_lanes(inputs: Inputs) -> EnsembleSolution:
     return solution
 
 
-def _run(inputs: Inputs) -> tuple[EnsembleSolution, Run]:
+def _run(inputs: Inputs) -> tuple[EnsembleSolution, LaneRun]:
     equations, batch = inputs
     equations = in_steps(equations)
     run = Schedule(equations, batch.each, batch.complete, _LONGEST).run()

@@ -46,8 +46,7 @@ def _times_and_values(inputs: Inputs) -> Any:
 
 
 def gradient_of_mapped(inputs: Inputs, differentiated: Any, bar: Any) -> Any:
-    """Return the gradient from the cotangents of times and values, each trajectory by the reverse
-    sweep of `diffeqsolve`."""
+    """Return the gradient from the cotangents of times and values, by the sweep of `diffeqsolve`."""
     smooth, rest = eqx.partition(inputs, differentiated)
     saved = lambda smooth: _times_and_values(eqx.combine(smooth, rest))
     values, pullback = jax.vjp(saved, smooth)

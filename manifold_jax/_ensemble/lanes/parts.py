@@ -9,13 +9,13 @@ import jax
 
 from ..._adjoint.replay import subs_of
 from .arguments import Batch
-from .trajectory import Equations, Given
+from .trajectory import LaneEquations, TrajectoryData
 
 
 class Inputs(NamedTuple):
     """The data that all trajectories have in common, and those that each has of its own."""
 
-    equations: Equations
+    equations: LaneEquations
     batch: Batch
 
     def with_solver(self, solver: Any) -> "Inputs":
@@ -38,7 +38,7 @@ class Parts(NamedTuple):
         without = lambda x: x._replace(batch=dataclasses.replace(x.batch, each=None))
         return Parts(smooth.batch.each, without(smooth), rest.batch.each, without(rest))
 
-    def one(self, each: Any, common: Any, rest_each: Any) -> tuple[Equations, Given]:
+    def one(self, each: Any, common: Any, rest_each: Any) -> tuple[LaneEquations, TrajectoryData]:
         """Return the equations, and the data of one trajectory."""
         equations, batch = eqx.combine(common, self.rest)
         return in_steps(equations), batch.complete(eqx.combine(each, rest_each))
@@ -53,7 +53,7 @@ class Parts(NamedTuple):
         return Inputs(equations, dataclasses.replace(batch, each=eqx.combine(each, self.rest_each)))
 
 
-def in_steps(equations: Equations) -> Equations:
+def in_steps(equations: LaneEquations) -> LaneEquations:
     """Return the equations with the solver as it is in the loop over steps."""
     solver = equations.solver.within(equations.controller, bends_interpolant=False)
     return dataclasses.replace(equations, solver=solver)

@@ -9,13 +9,13 @@ from .columns import Stacked
 from .trajectory import Trajectory
 
 
-class Ends(NamedTuple):
+class LaneEnds(NamedTuple):
     """Starts and ends of all `N` trajectories, which are the leading axis of every array."""
 
     start: Trajectory
     num_steps: Array
     rows: Array  # how many of the times to save at each has reached
-    states: Stacked | None  # the states at these times, a table (see [`Run`][])
+    states: Stacked | None  # the states at these times, a table (see [`LaneRun`][])
     first_bar: Any  # cotangents of the first and the last states, and of the values at `ts`
     last_bar: Any
     values_bar: Any
@@ -47,7 +47,7 @@ class Bars(NamedTuple):
     row: Array  # the last of the times to save at that is still to come
 
 
-class Record(NamedTuple):
+class LaneRecord(NamedTuple):
     """The steps of a segment, which are the leading axis of every array."""
 
     steps: Stacked  # their start and end times, and the states before them

@@ -19,20 +19,20 @@ from ..._adjoint.record import rows_backwards
 from ..._adjoint.replay import State
 from ..._jaxpr.lane_arrays import Lanes
 from ..._jaxpr.lane_interpreter import call_in_lanes
-from ..._jaxpr.lane_value import Columns, Layout, Value, where
+from ..._jaxpr.lane_value import ColumnLayout, Columns, LaneValue, where
 from .columns import added, read, Stacked, taken
 from .functions import begin, interpolate, save, smooth_part, step, step_state
 from .parts import Parts
-from .records import Bars, Ends, Group, InputBars, Record
-from .trajectory import Equations
+from .records import Bars, Group, InputBars, LaneEnds, LaneRecord
+from .trajectory import LaneEquations
 
 
 # Largest size of the record of a segment.
 _BYTES = 2**22
 
 
-class ReverseSweep:
-    """Cotangents of the inputs of `N` trajectories from those of their outputs, in [`Ends`][].
+class LaneReverseSweep:
+    """Cotangents of the inputs of `N` trajectories from those of their outputs, in [`LaneEnds`][].
 
     - `each`, `rest`, `starts`: the data that each trajectory has of its own, differentiated and not,
         and its start. `firsts`, `first_bar`, `last_bar`: its first state, and the cotangents of that and
@@ -45,7 +45,7 @@ class ReverseSweep:
     - `rows`: the number of steps in a segment. `needed`: see `_needed`.
     """
 
-    def __init__(self, parts: Parts, ends: Ends, limit: int):
+    def __init__(self, parts: Parts, ends: LaneEnds, limit: int):
         self.parts, self.ends = parts, ends
         equations = parts.rest.equations
         self.max_steps, self.ts = equations.max_steps, equations.saveat.subs.ts
@@ -57,11 +57,11 @@ class ReverseSweep:
         self.firsts, self.first_bar, self.last_bar = (
             of(x) for x in (ends.start.y, ends.first_bar, ends.last_bar)
         )
-        self.common = jtu.tree_map(Value.of_constant, parts.common)
+        self.common = jtu.tree_map(LaneValue.of_constant, parts.common)
         common = Columns.of_values(self.common, self.lanes)  # not inside a loop
         self.no_common = jtu.tree_map(jnp.zeros_like, common)
         self.values_bar = of(jtu.tree_map(lambda x: x.reshape(-1, *x.shape[2:]), ends.values_bar))
-        self.smooth_layout = Layout.of_one(smooth_part(step_state(ends.start)))
+        self.smooth_layout = ColumnLayout.of_one(smooth_part(step_state(ends.start)))
         self.needed = self._needed()
 
     def run(self) -> tuple[Any, Any]:
@@ -84,14 +84,14 @@ class ReverseSweep:
         used = [jnp.any(x.reshape(self.size, -1) != 0, axis=1) for x in jtu.tree_leaves(bars)]
         return jnp.any(jnp.stack(used), axis=0)
 
-    def _empty_record(self) -> Record:
+    def _empty_record(self) -> LaneRecord:
         start = self.ends.start
-        layout = Layout.of_one((start.tprev, start.tnext, step_state(start)))
+        layout = ColumnLayout.of_one((start.tprev, start.tnext, step_state(start)))
         one = Stacked.of(Columns.zeros(layout, self.lanes.count))
         rows = max(_BYTES // sum(x.nbytes for x in jtu.tree_leaves(one)), 1)
         self.rows = min(rows, self.max_steps)
         steps = jtu.tree_map(lambda x: jnp.zeros((self.rows, *x.shape), x.dtype), one)
-        return Record(steps, jnp.zeros((self.rows, self.lanes.count), bool))
+        return LaneRecord(steps, jnp.zeros((self.rows, self.lanes.count), bool))
 
     def _through_group(self, carry: Any, index: Array) -> tuple[Any, Columns]:
         record, common = carry
@@ -129,7 +129,7 @@ class ReverseSweep:
             with self.lanes.inside(first.columns[0]):
                 y = where(reached, read(states, place), first).values()
                 bar = taken(self.values_bar, place).values()
-                t = Value.of_column(jnp.broadcast_to(self.ts[row], reached.shape))
+                t = LaneValue.of_column(jnp.broadcast_to(self.ts[row], reached.shape))
                 inputs_bar, y_bar = self._transposed(save, group, y, bar, t)
                 bars = self._including(bars, group.present & reached, inputs_bar)
                 return bars, Stacked.of(Columns.of_values(y_bar, self.lanes))
@@ -137,7 +137,9 @@ class ReverseSweep:
         bars, at_times = lax.scan(at_time, bars, jnp.arange(self.ts.size))
         return group._replace(at_times=at_times), bars
 
-    def _through_segments(self, group: Group, bars: Bars, record: Record) -> tuple[Bars, Record]:
+    def _through_segments(
+        self, group: Group, bars: Bars, record: LaneRecord
+    ) -> tuple[Bars, LaneRecord]:
         """Make the steps again, segment by segment, and go back through them.
 
         One loop does both, so that the program contains a step and its transpose once. `firsts[k]` is
@@ -167,21 +169,21 @@ class ReverseSweep:
         *_, record, bars = lax.while_loop(lambda carry: carry[0] >= 0, through_segment, start)
         return bars, record
 
-    def _forwards(self, group: Group, state: Columns, record: Record) -> tuple[Any, ...]:
+    def _forwards(self, group: Group, state: Columns, record: LaneRecord) -> tuple[Any, ...]:
         """Make and record the steps of a segment; return how many there are, whether some lane goes
         on after it, the states there, and the record."""
 
         def goes_on(state: Columns) -> Array:
-            return self._column(Equations.goes_on, group, state.values()) & group.present
+            return self._column(LaneEquations.goes_on, group, state.values()) & group.present
 
         def onwards(carry: Any) -> Any:
             row, active, state, record = carry
             with self.lanes.inside(state.columns[0]):
                 before = state.values()
-                tried = self._of_one(Equations.attempt, group, before)
+                tried = self._of_one(LaneEquations.attempt, group, before)
                 made = before.tprev, before.tnext, step_state(before)
                 steps = Stacked.of(Columns.of_values(made, self.lanes))
-                new = Record(steps, active & tried.kept.columns(self.lanes)[0])
+                new = LaneRecord(steps, active & tried.kept.columns(self.lanes)[0])
                 record = jtu.tree_map(lambda x, new: x.at[row].set(new), record, new)
                 after = Columns.of_values(tried.trajectory, self.lanes)
                 state = where(active, after, state)
@@ -193,7 +195,7 @@ class ReverseSweep:
         row, active, state, record = lax.while_loop(unfinished, onwards, start)
         return row, jnp.any(active), state, record
 
-    def _through_step(self, group: Group, step: Record, bars: Bars) -> Bars:
+    def _through_step(self, group: Group, step: LaneRecord, bars: Bars) -> Bars:
         columns = step.steps.columns()
         with self.lanes.inside(columns.columns[0]):
             dense_info, pullback = self._call(self._step, group, *columns.values())
@@ -217,10 +219,9 @@ class ReverseSweep:
     def _through_rows(
         self, group: Group, accepted: Array, step: Columns, dense_info: Any, bars: Bars
     ) -> tuple[Bars, Any]:
-        """Transpose the interpolations to the times in a step: return the cotangent of the data of
-        its interpolation."""
+        """Transpose the interpolations in a step: return the cotangent of their data."""
         if group.at_times is None:
-            zero = lambda value: Value.of_constant(jnp.zeros(value.shape, value.dtype))
+            zero = lambda value: LaneValue.of_constant(jnp.zeros(value.shape, value.dtype))
             return bars, jtu.tree_map(zero, dense_info)
         info, (start, end) = Columns.of_values(dense_info, self.lanes), step.columns[:2]
         direction = self._column(lambda equations, given: given.direction, group)
@@ -233,7 +234,7 @@ class ReverseSweep:
             here, place = due(row), jnp.maximum(row, 0)
             with self.lanes.inside():
                 bar = jtu.tree_map(lambda x: x[place, :, lane].T, group.at_times).columns().values()
-                times = map(Value.of_column, (at(row), start, end))
+                times = map(LaneValue.of_column, (at(row), start, end))
                 _, more = self._transposed(interpolate, group, info.values(), bar, *times)
                 more = Columns.of_values(more, self.lanes)
                 return row - here.astype(row.dtype), added(info_bar, more, here)

@@ -20,7 +20,7 @@ from ..._base.types import Args, BoolScalar, FloatScalar, IntScalar, RealScalarL
 from ..._solve.prepare import prepare
 from ..._solve.setup import Consistent, ProblemData, Setup
 from ..._solve.times import is_time_missing
-from ..._solver.step.advance import HookState, StepStatistics
+from ..._solver.step.hook_state import HookState, StepStatistics
 
 
 class Trajectory(NamedTuple):
@@ -36,7 +36,7 @@ class Trajectory(NamedTuple):
     num_accepted: IntScalar
 
 
-class Given(NamedTuple):
+class TrajectoryData(NamedTuple):
     """The data that define a trajectory, besides those that all have in common."""
 
     t0: FloatScalar
@@ -50,7 +50,7 @@ class Given(NamedTuple):
         return jnp.where(self.t0 < self.t1, 1, -1).astype(self.t0.dtype)
 
 
-class Start(NamedTuple):
+class LaneStart(NamedTuple):
     trajectory: Trajectory
     correction: FloatScalar
 
@@ -65,7 +65,7 @@ class Attempt(NamedTuple):
     dense_info: Any
 
 
-class Outcome(NamedTuple):
+class LaneOutcome(NamedTuple):
     """The end of a trajectory."""
 
     t: FloatScalar
@@ -76,7 +76,7 @@ class Outcome(NamedTuple):
     statistics: StepStatistics
 
 
-class Equations(eqx.Module):
+class LaneEquations(eqx.Module):
     """The settings that all trajectories have in common."""
 
     terms: dfx.AbstractTerm
@@ -89,7 +89,7 @@ class Equations(eqx.Module):
     lanes: int = eqx.field(static=True)  # how many trajectories advance together
     consistent: Consistent = eqx.field(static=True)
 
-    def begin(self, given: Given) -> Start:
+    def begin(self, given: TrajectoryData) -> LaneStart:
         solver, args = self.solver, given.args
         settings = self.dt0, self.saveat, self.controller, self.consistent
         data = ProblemData(given.t0, given.t1, given.y0, args)
@@ -113,13 +113,13 @@ class Equations(eqx.Module):
         result = RESULTS.where(missing, RESULTS.nonfinite_input, result)  # pyright: ignore[reportArgumentType]
         zero = jnp.zeros((), jnp.int32)
         trajectory = Trajectory(t0, tnext, y0, solver_state, controller_state, result, zero, zero)
-        return Start(trajectory, ready.start.correction)
+        return LaneStart(trajectory, ready.start.correction)
 
-    def goes_on(self, given: Given, trajectory: Trajectory) -> BoolScalar:
+    def goes_on(self, given: TrajectoryData, trajectory: Trajectory) -> BoolScalar:
         before = trajectory.tprev < given.t1 * given.direction
         return before & is_okay(trajectory.result) & (trajectory.num_steps < self.max_steps)
 
-    def attempt(self, given: Given, trajectory: Trajectory) -> Attempt:
+    def attempt(self, given: TrajectoryData, trajectory: Trajectory) -> Attempt:
         solver, direction = self.solver, given.direction
         terms, t1 = directed(self.terms, direction), given.t1 * direction
         before, end = trajectory, trajectory.tnext
@@ -159,7 +159,7 @@ class Equations(eqx.Module):
         """Return the state inside a step, as the solver interpolates it. Times increase."""
         return self.solver.interpolation_cls(t0=start, t1=end, **dense_info).evaluate(t)
 
-    def saved_value(self, given: Given, t: FloatScalar, y: Y) -> tuple[Any, BoolScalar]:
+    def saved_value(self, given: TrajectoryData, t: FloatScalar, y: Y) -> tuple[Any, BoolScalar]:
         """Return the saved value of such a state, and whether it is on the manifold, at the true time."""
         success = jnp.asarray(True)
         if self.solver.corrects_output:
@@ -168,14 +168,14 @@ class Equations(eqx.Module):
             y = jtu.tree_map(lambda leaf: jnp.where(success, leaf, jnp.nan), y)
         return self.saveat.subs.fn(t, y, given.args), success
 
-    def outcome(self, given: Given, trajectory: Trajectory) -> Outcome:
+    def outcome(self, given: TrajectoryData, trajectory: Trajectory) -> LaneOutcome:
         result = trajectory.result
         unfinished = (trajectory.tprev < given.t1 * given.direction) & is_okay(result)
         result = RESULTS.where(unfinished, RESULTS.max_steps_reached, result)
         result = update_result(result, trajectory.solver_state.result)
         t = trajectory.tprev * given.direction
         counts = trajectory.num_steps, trajectory.num_accepted
-        return Outcome(t, trajectory.y, result, *counts, trajectory.solver_state.statistics)
+        return LaneOutcome(t, trajectory.y, result, *counts, trajectory.solver_state.statistics)
 
 
 def end_floor(t0: Array, t1: Array) -> Array:

@@ -103,8 +103,8 @@ def fingerprint_of_description(description: dict[str, Any]) -> str:
     return _fingerprint({name: x for name, x in description.items() if name not in added})
 
 
-def _fingerprint(words: Any) -> str:
-    return hashlib.sha256(json.dumps(words, sort_keys=True).encode()).hexdigest()
+def _fingerprint(values: Any) -> str:
+    return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()
 
 
 def is_partial(file: Path) -> bool:

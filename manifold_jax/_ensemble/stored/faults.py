@@ -12,8 +12,7 @@ _MOST = 5
 
 
 class Fault(NamedTuple):
-    """A fault of one file: its name in the folder, what is wrong, and the number of its chunk, `None`
-    for a description."""
+    """A fault of one file: its name, what is wrong, the number of its chunk (None for a description)."""
 
     file: str
     what: str

@@ -60,8 +60,7 @@ class StoredEnsemble:
 
     @property
     def finished(self) -> int:
-        """The number of trajectories computed so far. Chunks are written in order, `result` as the last
-        array of each."""
+        """The number of trajectories computed so far; `result` is the last array of a chunk."""
         ends = ((k + 1) * self.chunk for k in finished_chunks(self.group))
         return sum(self.chunk - max(0, end - self.size) for end in ends)
 

@@ -49,7 +49,7 @@ def is_first_same_as_last(tableau: dfx.ButcherTableau) -> bool:
     return tableau.fsal and tableau.ssal
 
 
-class ExplicitStep(NamedTuple):
+class ExplicitStepResult(NamedTuple):
     """The state at the end, the coordinates there and their embedded error estimate, the data of the
     solver's own interpolation, the vector field of the last stage, and the report of the correction."""
 
@@ -71,7 +71,7 @@ def explicit_step(
     args: Args,
     f0: Any,
     in_a_loop: bool | None = None,
-) -> ExplicitStep:
+) -> ExplicitStepResult:
     """Step from `y0`, with `f0` the vector field there, and correct the result.
 
     `frame.terms` are evaluated at the stages, `terms` at states on the manifold. By default stages are
@@ -107,7 +107,7 @@ def explicit_step(
         increments.append(frame.pull_back(end, w1, at_end, terms.prod(f1, control)))
     error = _combine(tableau.b_error, increments)
     k = jtu.tree_map(lambda *ks: jnp.stack(ks), *increments)
-    return ExplicitStep(y1, w1, error, dict(y0=w0, y1=w1, k=k), f1, info)
+    return ExplicitStepResult(y1, w1, error, dict(y0=w0, y1=w1, k=k), f1, info)
 
 
 def _stages(rows: list[Any], times: list[Array], increment: Callable, w0: Y, first: Y) -> list[Y]:

@@ -57,8 +57,7 @@ class Combination:
 
     - `differences`: of finite differences from forward mode, both with the same steps.
     - `exact`: of the gradient of the exact solution from forward mode, `None` if not known.
-    - `tangency`: the largest derivative of the residual at the end, relative to that of the
-        state.
+    - `tangency`: the largest derivative of the residual at the end, relative to that of the state.
     - `failure`: the reason why there is nothing to compare.
     """
 
