@@ -58,7 +58,7 @@ from ._solver.tangent import tangent_field as tangent_field
 
 
 # isort: split
-# Written against the names above alone, as extensions of other people are.
+# These use only the public names above, as extensions of others do.
 from ._lie_groups import (
     AbstractLieGroup as AbstractLieGroup,
     LieGroupChart as LieGroupChart,

@@ -145,6 +145,16 @@ def test_private_names_are_seen(code):
     assert list(private_names_of_others(ast.parse(code), OF_NAMED_TUPLES))
 
 
+def test_class_names_are_unique():
+    """In the whole package, so that a name that is read in one file means the same in another."""
+    found = {}
+    for path in FILES:
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.ClassDef):
+                found.setdefault(node.name, []).append(str(path.relative_to(PACKAGE)))
+    assert not {name: files for name, files in found.items() if len(files) > 1}
+
+
 # Bases of joints and drives that give fields or a common type, and nothing to implement.
 WITHOUT_METHODS = {"AbstractRestraint", "AbstractJointWithAxis", "AbstractJointWithoutAxis"}
 

@@ -6,9 +6,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from manifold_jax._dae.equations import Equations
+from manifold_jax._dae.equations import ResidualEquations
 from manifold_jax._dae.occurrence import Example, nonlinear_unknowns, Occurrence
-from manifold_jax._dae.signature import ABSENT, signature, SingularParts, Structure
+from manifold_jax._dae.signature import ABSENT, DAEStructure, signature, SingularParts
 from manifold_jax._jaxpr.incidence import incidence
 from manifold_jax._linalg.coloring import greedy_colors
 
@@ -106,7 +106,7 @@ def test_asdex_agrees():
 
 
 def analyzed(model, x, args, order=1):
-    equations = Equations.of(model, x, args, order)
+    equations = ResidualEquations.of(model, x, args, order)
     example = Example.of(equations, jax.flatten_util.ravel_pytree(x)[0], args)
     return example, Occurrence.of(example)
 
@@ -169,7 +169,7 @@ def pantelides(sigma):
 def test_offsets_of_models(case):
     *model, index, freedom = case
     _, occurrence = analyzed(*model)
-    structure = Structure.of(signature(occurrence.there))
+    structure = DAEStructure.of(signature(occurrence.there))
     assert (structure.index, structure.degrees_of_freedom) == (index, freedom)
     np.testing.assert_array_equal(structure.c, pantelides(structure.sigma))
     np.testing.assert_array_equal(structure.leading.any(axis=0), True)
@@ -181,7 +181,7 @@ def test_offsets_of_random_matrices():
         n = random.integers(2, 7)
         sigma = random.integers(0, 4, (n, n))
         sigma = np.where(random.uniform(size=(n, n)) < 0.55, ABSENT, sigma)
-        expected, structure = pantelides(sigma), Structure.of(sigma)
+        expected, structure = pantelides(sigma), DAEStructure.of(sigma)
         singular += expected is None
         assert (structure is None) == (expected is None)
         if structure is not None:

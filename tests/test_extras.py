@@ -6,7 +6,7 @@ import pytest
 
 from manifold_jax import __main__ as command_line
 from manifold_jax._base.extras import require
-from manifold_jax._ensemble.api.progress import Meter
+from manifold_jax._ensemble.api.progress import ChunkMeter
 
 
 @pytest.fixture
@@ -37,7 +37,7 @@ def test_pictures_say_what_to_install(without):
 def test_progress_without_rich_is_lines(without, capsys, monkeypatch):
     monkeypatch.setenv("TTY_COMPATIBLE", "1")
     without("rich")
-    with Meter(10, 0, 0, True) as meter:
+    with ChunkMeter(10, 0, 0, True) as meter:
         meter.compiling()
         meter.advance(10, 0)
     assert capsys.readouterr().out.splitlines()[0] == "ensemble: compiling"

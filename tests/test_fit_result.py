@@ -14,7 +14,7 @@ from fit_cases import fit_circle, noisy, positions, START, TRUTH, TS, TURN, Y0
 import manifold_jax as mj
 from manifold_jax._fit import convergence, optimize
 from manifold_jax._fit.parameters import make_transform
-from manifold_jax._fit.progress import Meter
+from manifold_jax._fit.progress import FitMeter
 from manifold_jax._fit.quality import gauss_newton
 from manifold_jax._fit.starts import draw_points
 
@@ -201,7 +201,7 @@ def test_progress_in_a_file_and_on_a_terminal(capsys, monkeypatch):
 def test_lines_of_progress_get_rarer(capsys, monkeypatch):
     now = [0.0]
     monkeypatch.setattr("time.perf_counter", lambda: now[0])
-    with Meter(True) as meter:
+    with FitMeter(True) as meter:
         meter.begin("fit", 4000)
         for _ in range(4000):
             now[0] += 0.3

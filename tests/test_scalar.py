@@ -9,7 +9,7 @@ import pytest
 import manifold_jax as mj
 from manifold_jax._jaxpr.lane_arrays import Lanes, NotScalarError
 from manifold_jax._jaxpr.lane_interpreter import call_in_lanes
-from manifold_jax._jaxpr.lane_value import Value
+from manifold_jax._jaxpr.lane_value import LaneValue
 
 
 SIZE = 5
@@ -20,7 +20,7 @@ def in_lanes(function, *args, limit=100_000):
     lanes = Lanes(SIZE, limit)
 
     def run(*args):
-        values = jtu.tree_map(lambda x: Value.of_whole(jnp.moveaxis(x, 0, -1)), args)
+        values = jtu.tree_map(lambda x: LaneValue.of_whole(jnp.moveaxis(x, 0, -1)), args)
         out = call_in_lanes(lanes, function, *values)
         return jtu.tree_map(lambda v: jnp.moveaxis(v.whole(lanes), -1, 0), out)
 
@@ -134,7 +134,7 @@ def test_sines_are_computed_once():
     def run(x):
         lanes = Lanes(SIZE, 100)
         with lanes.inside(x[0]):
-            out = call_in_lanes(lanes, function, Value.of_whole(x))
+            out = call_in_lanes(lanes, function, LaneValue.of_whole(x))
             return out.columns(lanes)
 
     program = jax.jit(run).lower(jnp.ones((1, SIZE))).compile().as_text()

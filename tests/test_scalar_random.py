@@ -17,7 +17,7 @@ from jax import lax
 
 from manifold_jax._jaxpr.lane_arrays import Lanes
 from manifold_jax._jaxpr.lane_interpreter import call_in_lanes
-from manifold_jax._jaxpr.lane_value import Value
+from manifold_jax._jaxpr.lane_value import LaneValue
 
 
 SIZE = 6
@@ -265,7 +265,7 @@ def derivatives(seed, x, n):
 def lanes_and_vmap(function, x, n):
     def run(x, n):
         lanes = Lanes(SIZE, 100_000)
-        whole = (Value.of_whole(jnp.moveaxis(a, 0, -1)) for a in (x, n))
+        whole = (LaneValue.of_whole(jnp.moveaxis(a, 0, -1)) for a in (x, n))
         out = call_in_lanes(lanes, function, *whole)
         return jtu.tree_map(lambda v: jnp.moveaxis(v.whole(lanes), -1, 0), out)
 

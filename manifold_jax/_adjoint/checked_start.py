@@ -1,4 +1,4 @@
-"""A state that cannot be solved from ends the solve before its first step."""
+"""Ends a solve before its first step if its state cannot be used."""
 
 from typing import Any
 
@@ -9,10 +9,11 @@ from .._base.rejection import result_of_state
 
 
 class CheckedStartAdjoint(dfx.AbstractAdjoint):
-    """Another adjoint, in a solve whose initial state may be NaN.
+    """Wraps the adjoint of a solve whose initial state may be NaN.
 
     The error relative to such a state is NaN, too, and an adaptive controller would reject all of
-    `max_steps` steps."""
+    `max_steps` steps.
+    """
 
     adjoint: dfx.AbstractAdjoint
 

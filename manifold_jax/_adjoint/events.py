@@ -1,4 +1,4 @@
-"""The time of an event, found when the solve is over: of several in one step, the first."""
+"""Location of events after the solve: of several in one step, the first one ends it."""
 
 from typing import Any
 
@@ -28,11 +28,11 @@ from .._solver.base import AbstractManifoldSolver
 
 
 class LocatingAdjoint(dfx.AbstractAdjoint):
-    """Another adjoint, in a solve with events that have a root finder.
+    """Wraps the adjoint of a solve with events that have a root finder.
 
-    Diffrax looks for the root of the first event in the order of `cond_fn` that has changed its
-    sign in the last step. Here those of all events that have are looked for, and the earliest
-    ends the solve. The derivative of its time is that of the implicit function.
+    Diffrax looks for the root of a single event, the first one in the order of `cond_fn` whose sign has
+    changed in the last step. Here the roots of all events whose sign has changed are found, and the
+    earliest ends the solve. The derivative of its time is that of the implicit function.
     """
 
     adjoint: dfx.AbstractAdjoint
@@ -51,7 +51,7 @@ class LocatingAdjoint(dfx.AbstractAdjoint):
         return new.put_into(final_state), statistics
 
 
-# What Diffrax passes to an event function by name, besides time, state and `args`.
+# Keyword arguments that Diffrax passes to an event function, besides time, state and `args`.
 EVENT_KEYWORDS = ("saveat", "solver", "terms", "t0", "t1", "dt0", "stepsize_controller")
 EVENT_KEYWORDS += ("max_steps",)
 
@@ -74,7 +74,7 @@ class _EventsInStep:
         )
 
     def first(self) -> tuple[FloatScalar, Bool[Array, " events"], RESULTS]:
-        """The time of the first event, which one it was, and whether its root was found."""
+        """Return the time of the first event, which one it was, and whether its root was found."""
         changed = self._changed() if len(self.events) > 1 else self.mask
         times, results = jax.vmap(self._root)(jnp.arange(len(self.events)), changed)
         order = jnp.where(changed, lax.stop_gradient(times), jnp.inf)
@@ -94,8 +94,7 @@ class _EventsInStep:
         return y, info.success
 
     def _values(self, t: FloatScalar) -> Float[Array, " events"]:
-        """Return the values of the event functions; of a condition that is true or false: how long
-        it is until the end of the step."""
+        """Return the values of the event functions; for Boolean conditions, the time left in the step."""
         y, _ = self._state(t)
 
         def value(event, after):
@@ -106,7 +105,7 @@ class _EventsInStep:
         return jnp.stack([value(*of) for of in zip(self.events, self.after, strict=True)])
 
     def _changed(self) -> Bool[Array, " events"]:
-        """The events that have happened in this step, not only the first in their order."""
+        """Return which events have happened in this step, not only the first in their order."""
 
         def has(before, after, direction):
             if after.dtype == bool:
@@ -121,7 +120,7 @@ class _EventsInStep:
         return jnp.stack([has(*of) for of in each]) | self.mask
 
     def _root(self, i: IntScalar, changed: BoolScalar) -> tuple[FloatScalar, optx.RESULTS]:
-        def value(t, _):  # its root is the end of the step if nothing is looked for
+        def value(t, _):  # its root is the end of the step if the event has not happened
             there = self._values(jnp.where(changed, t, self.end))[i]
             return jnp.where(changed, there, self.end - t)
 
@@ -139,7 +138,7 @@ class _EventsInStep:
 def _ending(
     old: Ending, num_accepted: IntScalar, last_step: _EventsInStep, located: BoolScalar
 ) -> Ending:
-    """How the solve ends with its first event, where there is one."""
+    """Return how the solve ends with its first event, if there is one."""
     t, first, found = last_step.first()
     y = last_step.interpolation.evaluate(t)
     mask = jtu.tree_unflatten(jtu.tree_structure(old.event_mask), list(first))
@@ -164,10 +163,10 @@ def _saved_until(
     end: tuple[FloatScalar, Any],
     empty: tuple[FloatScalar, float],
 ) -> SaveState:
-    """Rows before the event, and that of the event where the end is saved."""
+    """Return the rows before the event, and that of the event if the end is saved."""
     t, value = end
     num_times = 0 if sub.ts is None else jnp.sum(sub.ts <= t)
-    # Without that of the last step.
+    # Without the row of the last step.
     num_steps = (num_accepted - 1) // sub.steps if sub.steps else 0
     ends = sub.t1 | (num_accepted % sub.steps == 0) if sub.steps else sub.t1
     count = int(sub.t0) + num_times + num_steps

@@ -1,5 +1,5 @@
-"""Forward mode of a solve with the steps that were made, as reverse mode has it: where steps end is
-held fixed, but for the end of the solve."""
+"""Forward mode at the steps that were made, as in reverse mode: the ends of steps are held fixed,
+except for the end of the solve."""
 
 from typing import Any
 
@@ -13,7 +13,7 @@ from .._linalg.newton import without_derivative
 
 
 class SizesHeldFixed(dfx.AbstractStepSizeController):
-    """Another controller, whose choices have no derivatives."""
+    """Wraps a controller; the step sizes it chooses have no derivatives."""
 
     controller: dfx.AbstractStepSizeController
 
@@ -26,13 +26,13 @@ class SizesHeldFixed(dfx.AbstractStepSizeController):
     def adapt_step_size(self, t0, t1, y0, y1_candidate, args, y_error, error_order, state) -> Any:
         fixed = without_derivative((t0, t1, y0, y1_candidate, args, y_error, error_order, state))
         keep, next_t0, next_t1, jump, state, result = self.controller.adapt_step_size(*fixed)
-        # A step begins where the one before has ended, which may be the end of the solve.
+        # A step begins at the end of the one before, which may be the end of the solve.
         ends = jnp.where(next_t0 == fixed[1], t1, jnp.where(next_t0 == fixed[0], t0, next_t0))
         return keep, ends, next_t1, jump, state, result
 
 
 def with_end_held_fixed(state: LoopState, t1: Any) -> LoopState:
-    """The first step ends where it does, unless that is the end of the solve."""
+    """Hold the end of the first step fixed, unless it is the end of the solve."""
     tnext = Progress.of(state).tnext
     return with_next_time(state, jnp.where(tnext == t1, t1, lax.stop_gradient(tnext)))
 
@@ -40,8 +40,8 @@ def with_end_held_fixed(state: LoopState, t1: Any) -> LoopState:
 def event_of_controller(
     event: dfx.Event | None, controller: dfx.AbstractStepSizeController
 ) -> dfx.Event | None:
-    """The event with the controller that was given, whose tolerances Diffrax's own event functions ask
-    for, in the place of the one that is wrapped around it."""
+    """Return the event with the original controller, whose tolerances Diffrax's own event functions ask
+    for, instead of the wrapped one."""
     if event is None:
         return None
 

@@ -1,4 +1,4 @@
-"""A gradient in the reverse sweep of a solve, and what it passes."""
+"""The quantities that the reverse sweep of a solve carries."""
 
 from typing import Any, NamedTuple
 
@@ -12,24 +12,24 @@ from .replay import State
 
 
 class Ends(NamedTuple):
-    """Where a solve began and ended, its numbers of steps, and the state at its end."""
+    """The ends of a solve, its numbers of steps, and the state at its end."""
 
     t0: FloatScalar
-    t1: FloatScalar  # where it was to end
+    t1: FloatScalar  # where it was supposed to end
     last: FloatScalar
     num_steps: IntScalar
     num_accepted: IntScalar
     y: Y
 
 
-class Step(NamedTuple):
+class RecordedStep(NamedTuple):
     """One recorded step, or several along leading axes."""
 
     start: Float[Array, "*steps"]
     end: Float[Array, "*steps"]
-    jumped: Bool[Array, "*steps"] | None  # if steps may begin behind jumps
+    jumped: Bool[Array, "*steps"] | None  # None if no steps begin after jumps
     accepted: Bool[Array, "*steps"]
-    state: Vectors  # from which it was made
+    state: Vectors  # from which the step was made
 
     @property
     def begins_at_jump(self) -> Bool[Array, "*steps"] | bool:
@@ -37,19 +37,20 @@ class Step(NamedTuple):
 
 
 class TimesBar(NamedTuple):
-    """Cotangents with respect to the ends of the solve and to the times of `SaveAt(ts=...)`. The
-    ends of all other steps are what they are."""
+    """Cotangents of the ends of the solve and of the times of `SaveAt(ts=...)`; other steps are fixed."""
 
     t0: FloatScalar
     t1: FloatScalar
     ts: list[Float[Array, " times"] | None]
 
-    def at_ends_of_step(self, ends: Ends, step: Step, start_bar: Any, end_bar: Any) -> "TimesBar":
+    def at_ends_of_step(
+        self, ends: Ends, step: RecordedStep, start_bar: Any, end_bar: Any
+    ) -> "TimesBar":
         t0 = self.t0 + jnp.where(step.start == ends.t0, start_bar, 0)
         return self._replace(t0=t0, t1=self.t1 + jnp.where(step.end == ends.t1, end_bar, 0))
 
     def at_end_of_solve(self, ends: Ends, t: Any, bar: FloatScalar) -> "TimesBar":
-        """A value saved at `t`, if that is one of the ends."""
+        """Add the cotangent of a value saved at `t` to that of an end of the solve, if `t` is one."""
         at_start = t == ends.t0
         t0 = self.t0 + jnp.where(at_start, bar, 0)
         return self._replace(t0=t0, t1=self.t1 + jnp.where((t == ends.t1) & ~at_start, bar, 0))
@@ -61,14 +62,14 @@ class TimesBar(NamedTuple):
 
 
 class Gradient(NamedTuple):
-    """Cotangents with respect to the state behind accepted step `number`, to the leaves of the
-    functions and to times so far; `rows` are the last rows of each saving still to come."""
+    """Cotangents of the state after accepted step `number`, and so far of the leaves of the functions
+    and of times; `rows` are the last rows of each saving that are still to come."""
 
     number: IntScalar
     rows: list[IntScalar]
     state: State
     leaves: Any
-    times: TimesBar | None  # if they have derivatives
+    times: TimesBar | None  # None if they have no derivatives
 
 
 def add(a: Any, b: Any) -> Any:
@@ -80,5 +81,5 @@ def replaced(items: list, k: int, item: Any) -> list:
 
 
 def with_zeros(values: Any, bars: Any) -> Any:
-    """Cotangents of `values`, zero instead of `None` where there are none."""
+    """Return the cotangents of `values`, with zeros instead of `None`."""
     return jtu.tree_map(lambda x, bar: jnp.zeros_like(x) if bar is None else bar, values, bars)

@@ -1,4 +1,4 @@
-"""What a solve leaves behind for its reverse sweep: when each step was made, and from which state."""
+"""The record of a solve for its reverse sweep: when each step was made, and from which state."""
 
 import math
 from collections.abc import Callable
@@ -15,25 +15,32 @@ from .._base.compat import buffer_at_set, MaybeBuffer, Progress, unvmap_max, whi
 from .._base.types import IntScalar
 
 
-# A block whose arrays are small, as XLA for CPUs sees them, which then runs the operations of a loop one
-# after the other instead of handing them to threads. With larger ones gradients take 1.3 times as
-# long with jaxlib 0.10.2, and as long with 0.12.0.1 (`python -m benchmarks.speed.thresholds`).
+# Blocks have `_FEWEST` steps if their states then take at most `_SMALL` bytes: XLA for CPUs runs the
+# operations of a loop on such small arrays one after the other instead of handing them to threads. With
+# larger blocks gradients take 1.3 times as long with jaxlib 0.10.2, and as long with 0.12.0.1
+# (`python -m benchmarks.speed.thresholds`).
 _SMALL, _FEWEST = 512, 8
-# States that are all kept: as many as fit into this, and not more than a batch has use for, as
-# memory that is not in a cache takes longer to fill than a small state to compute again.
+# All states of the first steps are kept: as many as fit into `_BYTES`, but at most `_STATES`, as memory
+# that is not in a cache takes longer to fill than a small state to compute again.
 _BYTES, _STATES = 2**20, 512
 
 
 class Sizes(NamedTuple):
-    """Steps of a block, blocks of a segment, all blocks, and those of which all states are kept."""
+    """The division of the steps of a solve into blocks, and of blocks into segments."""
 
-    block: int
-    segment: int
-    blocks: int
-    kept: int
+    block: int  # steps in a block
+    segment: int  # blocks in a segment
+    blocks: int  # blocks in all
+    kept: int  # blocks, the first ones, of which all states are kept
 
     @staticmethod
     def of(nbytes: int, max_steps: int, checkpoints: int | None) -> "Sizes":
+        """Choose sizes for states of `nbytes` bytes. A segment has about `sqrt(max_steps)` steps, or more
+        where `checkpoints` states, one for each segment, would not suffice for that.
+
+        For 32 bytes, 4096 steps and `checkpoints=None`: segments of 64 steps, in 8 blocks of 8 steps,
+        which take 256 bytes. There are 64 segments in 512 blocks. The states of 512 steps fit, so those
+        of the first 64 blocks are kept: `Sizes(8, 8, 512, 64)`."""
         steps = max(math.isqrt(max_steps), -(-max_steps // (checkpoints or max_steps)))
         block = min(_FEWEST, steps) if nbytes * _FEWEST <= _SMALL else steps
         segment = -(-steps // block)
@@ -46,11 +53,11 @@ class Sizes(NamedTuple):
         return Sizes(block, segment, segments * segment, min(kept, segments) * segment)
 
 
-Vectors = dict[str, Any]  # of each type of number one, also buffers of such
+Vectors = dict[str, Any]  # one vector for each dtype, or a buffer of such vectors
 
 
 class Packing(eqx.Module):
-    """A pytree of arrays as one vector for each type of number, and back."""
+    """Packs a pytree of arrays into one vector for each dtype, and unpacks it."""
 
     leaves: list[jax.ShapeDtypeStruct] = eqx.field(static=True)
     structure: Any = eqx.field(static=True)
@@ -82,18 +89,17 @@ class Packing(eqx.Module):
 
 
 class Record(eqx.Module):
-    """The steps of a solve, rejected ones included, in blocks: when each was made, and the states
-    from which they were made: all of the first few, of later ones the first of each segment,
-    which has several blocks.
+    """The steps of a solve, rejected ones included: their times, and states from which they were made.
+    All states of the first blocks are kept, of later ones only the first state of each segment.
 
     Rejected steps take rows so that the trajectories of a batch, which have the same number of
-    steps until they end, write to the same row: an index of its own for each would make a
-    slice a scatter, which takes longer than the step.
+    steps until they end, write to the same row: with an index for each of them the slice would
+    become a scatter, which takes longer than the step.
     """
 
     times: MaybeBuffer[Float[Array, "blocks block columns"]]
     states: Vectors  # (kept blocks, block, n)
-    firsts: Vectors  # (segments, n); none if all states are kept
+    firsts: Vectors  # (segments, n); empty if all states are kept
     packing: Packing = eqx.field(static=True)
     sizes: Sizes = eqx.field(static=True)
 
@@ -148,7 +154,7 @@ def rows_backwards(rows: Any, count: IntScalar, through: Callable, carry: Any) -
 
 
 def recording(record: Record, of: Callable[[Any], Any], run: Callable) -> tuple[Any, Record]:
-    """`run(while_loop)` with `while_loop` as Diffrax's outer loop, and what it recorded of
+    """`run(while_loop)` with `while_loop` as the outer loop of Diffrax, which also makes a record of
     the states `of(loop state)`."""
     written = record
 

@@ -1,4 +1,4 @@
-"""A solve as functions of single steps and of what is saved in them."""
+"""A solve as functions of single steps and of the values saved in them."""
 
 import dataclasses
 from collections.abc import Callable
@@ -15,20 +15,20 @@ from .._base.closure import convert_closure
 from .._base.compat import Differentiable, LoopState, Progress
 from .._base.types import Args, RealScalarLike, Y
 from .._constraint.projection_info import ProjectionInfo
-from .._solver.step.advance import HookState
 from .._solver.step.execution import execution_of, ExplicitStep
 from .._solver.step.frame import StepFrame
+from .._solver.step.hook_state import HookState
 
 
 class State(NamedTuple):
-    """All that a step starts from: the state of the equation, and what the solver remembers."""
+    """Everything that a step depends on: the state of the equation, and the solver's memory."""
 
     y: Y
     memory: Any
 
 
 class Saving(eqx.Module):
-    """One `SubSaveAt`: which rows it has, and the functions that make them."""
+    """One `SubSaveAt`: which rows it has, and the functions that compute them."""
 
     offset: int = eqx.field(static=True)  # 1 if the first row is that of `t0`, else 0
     num_times: int = eqx.field(static=True)
@@ -39,14 +39,14 @@ class Saving(eqx.Module):
 
 
 class Replay(eqx.Module):
-    """A solve as functions of single steps. What they close over are their leaves."""
+    """A solve as functions of single steps, pytrees whose leaves are the arrays that they close over."""
 
     step: Callable  # (start, end, jumped, state) -> next state, dense_info or None
     savings: list[Saving]
 
     @staticmethod
     def build(solve: "Solve", saveat: dfx.SaveAt, t: Array, start: State, dense: bool) -> "Replay":
-        """`t` and `start` are examples; `dense` says whether `dense_info` is asked for itself."""
+        """Build the functions; `t` and `start` are examples, `dense` whether `dense_info` is needed."""
         subs = subs_of(saveat)
         interpolates = dense or any(sub.ts is not None for sub in subs)
 
@@ -69,7 +69,9 @@ class Replay(eqx.Module):
             times = t, t, t
             between = None if sub.ts is None else convert_closure(in_step, *times, dense_info)
             num_times = 0 if sub.ts is None else len(sub.ts)
-            at_end = sub.t1 and sub.steps != 1  # with every step the last row is one of those
+            at_end = (
+                sub.t1 and sub.steps != 1
+            )  # if every step is saved, the last row is one of those
             at_state_ = convert_closure(at_state, t, start.y)
             return Saving(int(sub.t0), num_times, sub.steps, at_end, at_state_, between)
 
@@ -77,19 +79,19 @@ class Replay(eqx.Module):
 
 
 class Solve(NamedTuple):
-    """What is the same in every step."""
+    """The arguments that all steps have in common."""
 
     terms: Any
     solver: dfx.AbstractSolver
     args: Args
-    solver_state: Any  # of the first step, for what is not remembered of it
+    solver_state: Any  # that of the first step, for the parts that steps do not depend on
     remembers: bool  # whether steps depend on the solver's state
-    jumps: bool  # whether steps may begin behind jumps of the field
+    jumps: bool  # whether steps may begin after jumps of the field
 
     @staticmethod
     def of(terms: Any, solver: Any, args: Args, init_state: LoopState, controller: Any) -> "Solve":
         begin = Progress.of(init_state)
-        # The step of a solver of Diffrax itself is written out, and then remembers nothing.
+        # The step of a solver of Diffrax itself is written out, and then has no memory.
         execution = execution_of(solver, terms, begin.tprev, begin.tnext, begin.y, args)
         written_out = isinstance(execution, ExplicitStep)
         jumps = may_jump(controller, begin.made_jump)
@@ -103,7 +105,7 @@ class Solve(NamedTuple):
     def attempt(
         self, start: RealScalarLike, end: RealScalarLike, jumped: Any, state: State
     ) -> tuple[State, Any]:
-        """The state behind a step, and the data of its interpolation."""
+        """Return the state after a step, and the data of its interpolation."""
         terms, solver, args, y = self.terms, self.solver, self.args, state.y
         if not self.remembers:
             unchanged = lambda y: (y, ProjectionInfo.of_nothing(y, jnp.asarray(True)))
@@ -144,8 +146,7 @@ def may_jump(controller: Any, made_jump: Any) -> bool:
 
 
 def outputs_of(final_state: LoopState, remembers: bool) -> Differentiable:
-    """What has derivatives of the final state of a loop, of the solver's state what steps depend
-    on."""
+    """Return the differentiable part of a final state; of the solver's state, what steps depend on."""
     found = Differentiable.of(final_state)
     return found._replace(solver_state=memory_of(found.solver_state) if remembers else None)
 

@@ -1,4 +1,4 @@
-"""The reverse sweep: the recorded steps in reverse order, each computed once more and transposed."""
+"""The reverse sweep: the recorded steps in reverse order, each computed again and transposed."""
 
 from typing import Any, NamedTuple
 
@@ -9,7 +9,7 @@ import jax.tree_util as jtu
 
 from .._base.compat import unvmap_max
 from .._base.types import IntScalar
-from .gradient import add, Ends, Gradient, Step, TimesBar
+from .gradient import add, Ends, Gradient, RecordedStep, TimesBar
 from .record import counted_down, Record, rows_backwards, Vectors
 from .replay import Replay, State
 from .saved import Functions, SavedValues
@@ -62,20 +62,20 @@ class ReverseSweep(eqx.Module):
         counts = (saving.num_times for saving in self.functions.rest.savings)
         return TimesBar(zero, zero, [jnp.zeros(n, zero.dtype) if n else None for n in counts])
 
-    def _steps_of_segment(self, i: IntScalar) -> Step:
-        """Leading axes: blocks, steps."""
+    def _steps_of_segment(self, i: IntScalar) -> RecordedStep:
+        """Return the steps of a segment, with leading axes for blocks and steps."""
         record, sizes = self.record, self.record.sizes
         part = lambda x, i: lax.dynamic_slice_in_dim(x, i * sizes.segment, sizes.segment)
         times = part(record.times, i)
         accepted = times[..., 1] > -jnp.inf
-        # Rows of no accepted step hold one of no length from the first state: functions may refuse
-        # what is not a state or time.
+        # Rows that are not of an accepted step hold a step of length zero from the first state:
+        # functions may refuse anything that is not a state or a time.
         start, end = (jnp.where(accepted, times[..., i], self.ends.t0) for i in range(2))
         jumped = accepted & (times[..., 2] > 0) if record.jumps else None
         times = start, end, jumped, accepted
         last = max(sizes.kept // sizes.segment - 1, 0)
         kept = lambda: {k: part(x, jnp.minimum(i, last)) for k, x in record.states.items()}
-        again = lambda: self._states_again(i, Step(*times, {}))
+        again = lambda: self._states_again(i, RecordedStep(*times, {}))
         if not record.firsts:
             states = kept()
         elif not record.states:
@@ -84,10 +84,10 @@ class ReverseSweep(eqx.Module):
             states = lax.cond(i <= last, kept, again)
         first = record.packing.pack(self.first)
         used = lambda x, first: jnp.where(accepted[..., None], x, first)
-        return Step(*times, {k: used(x, first[k]) for k, x in states.items()})
+        return RecordedStep(*times, {k: used(x, first[k]) for k, x in states.items()})
 
-    def _states_again(self, i: IntScalar, steps: Step) -> Vectors:
-        """The states of a segment, computed from its first one."""
+    def _states_again(self, i: IntScalar, steps: RecordedStep) -> Vectors:
+        """Compute the states of a segment again from its first one."""
         record, packing = self.record, self.record.packing
 
         def advance(x, step):
@@ -114,7 +114,7 @@ class ReverseSweep(eqx.Module):
         count = jnp.minimum(-(-begun // sizes.block), sizes.segment)
         return counted_down(count, through_block, gradient)
 
-    def _through_step(self, gradient: Gradient, step: Step) -> Gradient:
+    def _through_step(self, gradient: Gradient, step: RecordedStep) -> Gradient:
         state = self.record.packing.unpack(step.state)
         smooth, discrete = eqx.partition(state, eqx.is_inexact_array)
 
@@ -125,7 +125,7 @@ class ReverseSweep(eqx.Module):
         (after, dense_info), pullback = self.functions.vjp(out, smooth, ends, times is not None)
         new = gradient
         for k in range(len(self.functions.rest.savings)):
-            new = self.saved.behind_step(new, k, step, after.y)
+            new = self.saved.after_step(new, k, step, after.y)
         zero = jtu.tree_map(jnp.zeros_like, dense_info)
         bar = self.dense.of(gradient.number, self.ends.num_accepted, zero)
         for k in range(len(self.functions.rest.savings)):

@@ -1,4 +1,4 @@
-"""The reverse sweep through saved values: to the states, steps and times that they are functions of."""
+"""The reverse sweep through saved values: to the states, steps and times that they depend on."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -11,12 +11,12 @@ import jax.tree_util as jtu
 from jaxtyping import Array, Bool, Float
 
 from .._base.types import FloatScalar, IntScalar, RealScalarLike, Y
-from .gradient import add, Ends, Gradient, replaced, Step
+from .gradient import add, Ends, Gradient, RecordedStep, replaced
 from .replay import Replay
 
 
 class Functions(eqx.Module):
-    """A [`Replay`][] in two parts: what has derivatives, and the rest."""
+    """A [`Replay`][] in two parts, with and without derivatives."""
 
     leaves: Any
     rest: Any
@@ -29,8 +29,8 @@ class Functions(eqx.Module):
         return eqx.combine(leaves, self.rest)
 
     def vjp(self, function: Callable, x: Any, times: Any, timed: bool) -> tuple[Any, Callable]:
-        """Return the real numbers of `function(replay, x, times)`, and what takes their cotangents
-        to those of the leaves, of `x` and, if `timed`, of `times`."""
+        """Return the real numbers of `function(replay, x, times)`, and their pullback to the leaves, to
+        `x` and, if `timed`, to `times`."""
 
         def value(leaves: Any, x: Any, moved: Any) -> Any:
             out = function(self.at(leaves), x, times if moved is None else moved)
@@ -40,8 +40,7 @@ class Functions(eqx.Module):
 
 
 class Rows(NamedTuple):
-    """What one of the savings has saved: times, how many rows come before that of the end, and
-    the cotangents of times and values."""
+    """The rows of one saving: times, how many precede that of the end, cotangents of times and values."""
 
     times: Float[Array, " rows"]
     count: IntScalar
@@ -72,7 +71,7 @@ class SavedValues(eqx.Module):
         return gradient
 
     def through_start(self, gradient: Gradient, first: Y) -> Gradient:
-        """The row of `t0`; without any step (`t0 == t1`) those of `ts` are copies of it."""
+        """Transpose the row of `t0`; without any step (`t0 == t1`) the rows of `ts` are copies of it."""
         for k, saving in enumerate(self._savings):
             if saving.offset or saving.num_times:
                 copies = jnp.where(self.ends.num_steps == 0, saving.num_times, 0)
@@ -83,7 +82,7 @@ class SavedValues(eqx.Module):
     def _through_copies(
         self, gradient: Gradient, k: int, used: Bool[Array, " rows"], t: RealScalarLike, y: Y
     ) -> Gradient:
-        """The rows of saving `k` that are the same function of one state."""
+        """Transpose the rows of saving `k` that are the same function of one state."""
         rows = self.rows[k]
         bar = jtu.tree_map(lambda b: jnp.sum(_only(used, b), axis=0), rows.values_bar)
         return self._through_value(gradient, k, t, y, bar, jnp.sum(_only(used, rows.times_bar)))
@@ -91,7 +90,7 @@ class SavedValues(eqx.Module):
     def _through_value(
         self, gradient: Gradient, k: int, t: Any, y: Y, bar: Any, t_bar: FloatScalar
     ) -> Gradient:
-        """What saving `k` saves of a state."""
+        """Transpose the value that saving `k` saves of a state."""
         saved, times = lambda replay, y, t: replay.savings[k].at_state(t, y), gradient.times
         _, pullback = self.functions.vjp(saved, y, t, times is not None)
         leaves_bar, y_bar, more = pullback(bar)
@@ -101,13 +100,13 @@ class SavedValues(eqx.Module):
         leaves = add(gradient.leaves, leaves_bar)
         return gradient._replace(state=state, leaves=leaves, times=times)
 
-    def behind_step(self, gradient: Gradient, k: int, step: Step, y: Y) -> Gradient:
-        """The row of the state behind a step, if it was saved."""
+    def after_step(self, gradient: Gradient, k: int, step: RecordedStep, y: Y) -> Gradient:
+        """Transpose the row of the state after a step, if it was saved."""
         saving, rows, row = self._savings[k], self.rows[k], gradient.rows[k]
         if not saving.steps:
             return gradient
         saved = (gradient.number % saving.steps == 0) & (row >= saving.offset)
-        # The time that was saved is that behind a jump at which the step ended.
+        # The time that was saved is the one after a jump at which the step ended.
         t = jnp.where(saved, rows.times[row], step.end)
         bar = jtu.tree_map(lambda b: jnp.where(saved, b[row], 0), rows.values_bar)
         t_bar = jnp.where(saved, rows.times_bar[row], 0)
@@ -115,9 +114,9 @@ class SavedValues(eqx.Module):
         return gradient._replace(rows=replaced(gradient.rows, k, row - jnp.where(saved, 1, 0)))
 
     def inside_step(
-        self, gradient: Gradient, k: int, step: Step, dense_info: Any, bar: Any
+        self, gradient: Gradient, k: int, step: RecordedStep, dense_info: Any, bar: Any
     ) -> tuple[Gradient, Any]:
-        """The rows interpolated in a step, and the cotangent of `dense_info`."""
+        """Transpose the rows interpolated in a step; return the cotangent of `dense_info`, too."""
         saving, rows = self._savings[k], self.rows[k]
         if not saving.num_times:
             return gradient, bar
@@ -127,8 +126,8 @@ class SavedValues(eqx.Module):
             gradient, _ = carry
             row = gradient.rows[k]
             t = rows.times[row]
-            # A time at the start of a step is saved at the end of the one before, from which only
-            # a jump separates it.
+            # A time at the start of a step is saved at the end of the one before, unless a jump is
+            # between.
             inside = first | (t > step.start) | ((t == step.start) & step.begins_at_jump)
             return step.accepted & (row >= saving.offset) & inside
 
@@ -156,5 +155,5 @@ class SavedValues(eqx.Module):
 
 
 def _only(used: Bool[Array, " rows"], x: Float[Array, "rows ..."]) -> Float[Array, "rows ..."]:
-    """The rows that are used, zeros for the others, whatever they hold."""
+    """Return the rows that are used, and zeros for the others, whatever they hold."""
     return jnp.where(used.reshape(used.shape + (1,) * (x.ndim - 1)), x, 0)

@@ -1,4 +1,4 @@
-"""The derivative of the steps that were made: backwards through their record, or forwards with them."""
+"""The derivative of the discrete solution, in reverse mode from a record of its steps."""
 
 from typing import Any
 
@@ -32,43 +32,40 @@ class StepReplayAdjoint(dfx.AbstractAdjoint):
     r"""The derivative of the discrete solution, in reverse and in forward mode; the default of
     [`diffeqsolve`][].
 
-    From the accepted steps $y_{i+1} = \Phi(t_i, t_{i+1}, y_i, \theta)$ and the gradient
+    For the accepted steps $y_{i+1} = \Phi(t_i, t_{i+1}, y_i, \theta)$ and the gradient
     $\bar y_n$ with respect to the last state
 
     $$\bar y_i = (\partial\Phi/\partial y_i)^T \bar y_{i+1} + (\partial s_i/\partial y_i)^T \bar s_i, \qquad
       \bar\theta = \sum_i (\partial\Phi/\partial\theta)^T \bar y_{i+1} + \dots$$
 
-    with $s_i$ what was saved in step $i$, events and the dense solution included. The solve
-    records $(t_i, t_{i+1})$ and some $y_i$, and the reverse sweep computes each step once more, of the
-    size that was recorded. `diffrax.RecursiveCheckpointAdjoint` repeats parts of the solve with its
+    with $s_i$ the values saved in step $i$, events and the dense solution included. The solve
+    records $(t_i, t_{i+1})$ and some $y_i$, and the reverse sweep computes each step again, with the
+    recorded size. `diffrax.RecursiveCheckpointAdjoint` repeats parts of the solve with its
     controller instead: rounded differently, repeated steps get other sizes, and its gradient is
     that of another solution. At tight tolerances it is less accurate than the solve, and with
-    additive methods (`KenCarp3` and a `MultiTerm`) it can be plainly wrong.
+    additive methods (`KenCarp3` and a `MultiTerm`) it can be wrong.
 
     Forward mode differentiates the solve itself with the ends of its steps held fixed, so that both
     modes give the same numbers. (It still makes the record: where only forward mode is needed,
     `diffrax.ForwardMode()` takes less memory.)
 
     Derivatives are those with respect to `y0`, `args`, all that terms, constraints and `fn` hold or
-    close over, `t0`, `t1` and `SaveAt(ts=...)`. Under `vmap` all trajectories go back with one
-    common counter.
+    close over, `t0`, `t1` and `SaveAt(ts=...)`. Under `vmap` all trajectories share one counter.
 
     **Arguments:**
 
-    - `checkpoints`: the largest number of states to record. By default those of the first 512
-        steps, or as many as fit into 1 MiB, and about `sqrt(max_steps)` of the others; the states
-        between two of these are computed again, once, about `sqrt(max_steps)` at a time.
-        `checkpoints=max_steps` records every state. Memory, besides these states: three numbers
-        for each of `max_steps`.
+    - `checkpoints`: the largest number of states to record. By default those of the first 512 steps, or
+        as many as fit into 1 MiB, and about `sqrt(max_steps)` of the others; the states between two of
+        these are computed again, once, about `sqrt(max_steps)` at a time. `checkpoints=max_steps`
+        records every state. Memory, besides these states: three numbers for each of `max_steps`.
 
     **Raises:**
 
-    `ValueError` for an `UnsafeBrownianPath`. `RuntimeError` when differentiating with
-    `max_steps=None`, as there is no room for the record, or with respect to `dt0`, on which a
-    solution depends by its error alone. Both modes can be differentiated forwards once more
-    (Hessian-vector products), but not in reverse mode: for that use `diffrax.DirectAdjoint()`.
-    With thousands of parameters in common under `vmap` (neural networks)
-    each trajectory sums up a gradient of its own.
+    `ValueError` for an `UnsafeBrownianPath`. `RuntimeError` when differentiating with `max_steps=None`,
+    as there is no room for the record, or with respect to `dt0`, on which a solution depends only by
+    its error. Both modes can be differentiated in forward mode once more (Hessian-vector products), but
+    not in reverse mode: for that use `diffrax.DirectAdjoint()`. Under `vmap` each trajectory sums up a
+    gradient with respect to shared parameters, also if they are thousands (neural networks).
 
     Source: Griewank & Walther, Evaluating Derivatives (2008), ch. 12, without recursion.
     """
@@ -144,7 +141,7 @@ class StepReplayAdjoint(dfx.AbstractAdjoint):
                 return run(_while_loop), None
             return recording(record, solve.state, run)
 
-        # What the functions close over becomes their leaves, which have derivatives.
+        # Closed-over arrays of the functions become leaves, which have derivatives.
         forward = convert_closure(forward, record)
         differentiable = replay, start, times, forward
         (final_state, statistics), outputs, _ = _solve(differentiable, record, solve.remembers)
@@ -171,7 +168,7 @@ def _while_loop(*args: Any, checkpoints: Any = None, **kwargs: Any) -> Any:
 
 @ForwardRule
 def _solve(differentiable, record, remembers):
-    """What the loop returns, what has derivatives of that, and what reverse mode needs."""
+    """Return the result of the loop; its differentiable part; the record and the final state."""
     *_, run = differentiable
     (state, statistics), record = run(record)
     return (state, statistics), outputs_of(state, remembers), (record, state)
@@ -179,57 +176,61 @@ def _solve(differentiable, record, remembers):
 
 @_solve.define_jvp
 def _solve_jvp(values, primals, tangents):
-    """Forwards the loop itself is differentiated, backwards its record is gone through."""
-    (differentiable, empty, remembers), (moved, *_) = primals, tangents
+    """In forward mode differentiate the loop itself, in reverse mode go through its record."""
+    (differentiable, empty, remembers), (tangents_in, *_) = primals, tangents
     structure = jtu.tree_structure(differentiable)
-    given = structure.flatten_up_to(moved)
-    perturbed = jtu.tree_unflatten(structure, [dx is not None for dx in given])
+    leaves_in = structure.flatten_up_to(tangents_in)  # None for leaves without a tangent
+    is_perturbed = jtu.tree_unflatten(structure, [dx is not None for dx in leaves_in])
     arrays, static = eqx.partition((differentiable, empty, values), eqx.is_array)
 
     def forward(arrays, tangents):
         differentiable, empty, _ = eqx.combine(arrays, static)
         each = iter(tangents)
-        along = [None if dx is None else next(each) for dx in given]
-        *_, along = jtu.tree_unflatten(structure, along)
+        tangents = [None if dx is None else next(each) for dx in leaves_in]
+        *_, run_tangent = jtu.tree_unflatten(structure, tangents)
 
         def final(run):
             (state, _), record = run(empty)
             values = outputs_of(state, remembers), (record, state)
             return eqx.filter(values, eqx.is_inexact_array)
 
-        return eqx.filter_jvp(final, (differentiable[-1],), (along,))[1]
+        return eqx.filter_jvp(final, (differentiable[-1],), (run_tangent,))[1]
 
-    def transpose(arrays, bar):
+    def transpose(arrays, cotangents_out):
         differentiable, _, values = eqx.combine(arrays, static)
-        gradient = _gradient(differentiable, perturbed, values, bar)
-        found = structure.flatten_up_to(gradient)
-        return [bar for bar, dx in zip(found, given, strict=True) if dx is not None]
+        gradient = structure.flatten_up_to(
+            _gradient(differentiable, is_perturbed, values, cotangents_out)
+        )
+        return [bar for bar, dx in zip(gradient, leaves_in, strict=True) if dx is not None]
 
-    like = eqx.filter(values[1:], eqx.is_inexact_array)
-    along = apply_linear(forward, transpose, like, arrays, [dx for dx in given if dx is not None])
-    return jtu.tree_map(lambda _: None, values[0]), *along
+    outputs_like = eqx.filter(values[1:], eqx.is_inexact_array)
+    given = [dx for dx in leaves_in if dx is not None]
+    tangents_out = apply_linear(forward, transpose, outputs_like, arrays, given)
+    return jtu.tree_map(lambda _: None, values[0]), *tangents_out
 
 
-def _gradient(differentiable, perturbed, values, bars):
+def _gradient(differentiable, is_perturbed, values, cotangents_out):
     _, outputs, (record, final_state) = values
-    given, beside = bars
+    outputs_bar, record_bar = cotangents_out
     if record is None:
         raise RuntimeError(_UNBOUNDED)
-    if jtu.tree_leaves(beside):
+    # Nothing but this function reads the record and the final state: that they have a cotangent means
+    # that the gradient computed here is being differentiated in reverse mode.
+    if jtu.tree_leaves(record_bar):
         raise RuntimeError(_TWICE_BACKWARDS)
     replay, start, (t0, t1, ts), run = differentiable
     end = Progress.of(final_state)
-    bar = with_zeros(eqx.filter(outputs, eqx.is_inexact_array), given)
+    bar = with_zeros(eqx.filter(outputs, eqx.is_inexact_array), outputs_bar)
     ends = Ends(t0, t1, end.tprev, end.num_steps, end.num_accepted_steps, end.y)
-    functions = Functions(*eqx.partition(replay, perturbed[0]))
+    functions = Functions(*eqx.partition(replay, is_perturbed[0]))
     dense = DenseBars(
-        bar.dense_infos if jtu.tree_leaves(given.dense_infos) else None,
-        bar.event_dense_info if jtu.tree_leaves(given.event_dense_info) else None,
+        bar.dense_infos if jtu.tree_leaves(outputs_bar.dense_infos) else None,
+        bar.event_dense_info if jtu.tree_leaves(outputs_bar.event_dense_info) else None,
     )
     saved = SavedValues(functions, ends, _rows(replay, save_states(final_state), bar, ends))
     back = ReverseSweep(functions, record, start, ends, saved, dense)
     last_bar = State(bar.y, bar.solver_state)
-    gradient = back.run(last_bar, timed=any(jtu.tree_leaves(perturbed[2])))
+    gradient = back.run(last_bar, timed=any(jtu.tree_leaves(is_perturbed[2])))
     times = gradient.times or TimesBar(None, None, [None] * len(ts))  # pyright: ignore[reportArgumentType]
     if gradient.times is not None and bar.dense_ts is not None:
         at = lambda t: jnp.sum(jnp.where(outputs.dense_ts == t, bar.dense_ts, 0))
@@ -249,8 +250,8 @@ def _rows(replay: Replay, saved: list[SaveState], bar: Differentiable, ends: End
 
 
 def _with_loops(solver: Any, kind: str) -> Any:
-    """Diffrax's loop over the stages of a step is of a kind that has no derivative forwards, nor
-    forwards of the one backwards, unless it is told otherwise (as its own adjoints do)."""
+    """Return the solver with the loop over its stages set, as the adjoints of Diffrax do: by default
+    that loop supports neither forward mode nor forward over reverse mode."""
     if getattr(solver, "scan_kind", "none") is not None:
         return solver
     return eqx.tree_at(lambda s: s.scan_kind, solver, kind, is_leaf=lambda x: x is None)

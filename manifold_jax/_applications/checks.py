@@ -1,4 +1,4 @@
-"""What cannot work: arguments, refused while tracing, and what turns out while running."""
+"""Checks of arguments while tracing, and faults that are found at run time."""
 
 from typing import Any
 
@@ -10,7 +10,7 @@ from .._base.compat import is_okay
 
 
 def check_function(name: str, function: Any, shape: tuple[int, ...], why: str, *inputs: Any):
-    """Refuse what is not a function of `inputs` to real arrays of this shape."""
+    """Refuse what is not a function of `inputs` that returns real arrays of this shape."""
     if not callable(function):
         raise TypeError(
             f"`{name}` must be a function `{name}(x, args)`, got {type(function).__name__}."
@@ -30,7 +30,7 @@ def check_counts(least: int, **counts: Any) -> None:
 
 
 def as_curve_start(x0: Any, parameter: int) -> Float[Array, " k"]:
-    """The unknowns of a curve as an array, `parameter` being one of them."""
+    """Return the unknowns of a curve as an array; `parameter` is the number of one of them."""
     if not hasattr(x0, "dtype") or x0.ndim != 1 or x0.size < 2:
         raise ValueError(
             "`x0` must be one array of shape (n + 1,), the unknowns including the parameter, got "
@@ -45,7 +45,7 @@ def as_curve_start(x0: Any, parameter: int) -> Float[Array, " k"]:
 
 
 def as_direction(direction: Any, x0: Float[Array, " k"], parameter: int) -> Float[Array, " k"]:
-    """A number as the direction of the parameter."""
+    """Return the direction as a vector; a number is the direction of the parameter."""
     direction = jnp.asarray(direction, x0.dtype)
     if direction.shape not in ((), x0.shape):
         raise ValueError(

@@ -45,8 +45,7 @@ class CurveTrace(eqx.Module):
     - `turning_points`: the points between the ends at which `dx[parameter]/ds` changes sign,
         in order, shape `(max_turning_points, k)`, to round-off; unused rows are NaN.
     - `turning_arclengths`: where they are, shape `(max_turning_points,)`, likewise.
-    - `num_turning_points`: how many there are; more than `max_turning_points` if they did not
-        all fit.
+    - `num_turning_points`: how many there are; more than `max_turning_points` if they did not all fit.
     - `result`: `RESULTS.successful`; `RESULTS.nonlinear_divergence` for an `x0` that cannot
         be used, a singular point, or a curve that ends; and the other codes of Diffrax.
     - `stats`: those of [`diffeqsolve`][]; `initial_correction` is how far `x0` was moved.
@@ -85,7 +84,7 @@ def trace_curve(
     """Follow the curve `H(x, args) = 0`, `n` equations in `n + 1` unknowns, by arclength.
 
     Solves `dx/ds = tau(x)`, `x(0) = x0` on the curve, where `DH tau = 0`, `|tau| = 1` and
-    the sign of `det [DH; tau^T]` stays what it was at `x0`. Folds, where a parameter among
+    the sign of `det [DH; tau^T]` stays that at `x0`. Folds, where a parameter among
     the unknowns turns back, are points like any other. Closed curves go round again.
 
     **Arguments:**
@@ -117,7 +116,7 @@ def trace_curve(
     if the start is not near the curve or singular, or if the trace meets a singular point. At every
     step the tangent must turn by less than 60 degrees and agree with the chord.
 
-    What it cannot see between two steps (at most `length / 50` apart): a pair of turning points,
+    Two things between steps (at most `length / 50` apart) go unnoticed: a pair of turning points,
     and a singular point at which the tangent hardly turns (branches that touch; or that cross at
     less than a degree, with tolerances above 1e-8). There is no branch switching; AUTO and
     BifurcationKit have it, and sparse matrices for more than about a hundred unknowns.

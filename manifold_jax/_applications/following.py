@@ -1,4 +1,4 @@
-"""A curve `H(x) = 0`: its tangent, where to start on it, the steps, and whether they hang together."""
+"""A curve `H(x) = 0`: its tangent, its start, the steps along it, and whether they stay on one branch."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -22,17 +22,16 @@ from .._solver import Projected
 
 @jax.custom_jvp
 def kernel(G: Float[Array, "n k"]) -> Float[Array, " k"]:
-    """The unit vector `tau` with `G tau = 0` and `det [G; tau^T] > 0`, for `k = n + 1`.
-    NaN where `G` does not have full rank."""
-    # E G^T = [1; 0], hence G tau = 0 for the last row tau of E; and
-    # E [G^T, tau] = [1, *; 0, |tau|^2].
+    """Return the unit vector `tau` with `G tau = 0` and `det [G; tau^T] > 0`, for `k = n + 1`. NaN
+    where `G` does not have full rank."""
+    # E G^T = [1; 0], hence G tau = 0 for the last row tau of E; and E [G^T, tau] = [1, *; 0, |tau|^2].
     E, sign = reduction(G.T)
     return sign * E[-1] / jnp.sqrt(jnp.sum(E[-1] ** 2))
 
 
 @kernel.defjvp
 def _kernel_derivative(primals, tangents):
-    """`G dtau = -dG tau`, `tau . dtau = 0`."""
+    """Differentiate: `G dtau = -dG tau`, `tau . dtau = 0`."""
     (G,), (dG,) = primals, tangents
     tau = kernel(G)
     system = factorize_by_reduction(jnp.concatenate([G, tau[None]]))
@@ -42,8 +41,8 @@ def _kernel_derivative(primals, tangents):
 class Curve(eqx.Module):
     """`H(x, args) = 0`, `n` equations in `k = n + 1` unknowns, in the form of a constraint.
 
-    What the user's function closes over are leaves, so that it can be differentiated or
-    held fixed. `orientation` is 1 or -1.
+    Closed-over arrays of the user's function are leaves, so that it can be differentiated or held
+    fixed. `orientation` is 1 or -1.
     """
 
     function: Callable
@@ -54,9 +53,9 @@ class Curve(eqx.Module):
         return self.function(x, self.args)
 
     def tangent(self, x: Float[Array, " k"]) -> Float[Array, " k"]:
-        """The unit vector `tau` with `G tau = 0` and `det [G; tau^T]` of the sign of the
-        orientation, `G = DH(x)`. Smooth also where the curve folds; changes sign where
-        another branch crosses. NaN where `G` does not have full rank.
+        """Return the unit vector `tau` with `G tau = 0` and `det [G; tau^T]` of the sign of the
+        orientation, `G = DH(x)`. Smooth also where the curve folds; changes sign where another branch
+        crosses. NaN where `G` does not have full rank.
 
         Source: Allgower & Georg, Definition 2.1.7 and Lemma 2.1.3.
         """
@@ -74,11 +73,11 @@ class Nodes(NamedTuple):
 def start_on(
     curve: Curve, x0: Float[Array, " k"], direction: Float[Array, " k"]
 ) -> tuple[Curve, Float[Array, " k"], ProjectionInfo, Bool[Array, " 4"]]:
-    """The curve with its orientation, the point to start from, how it was found, and what is
-    wrong with it: not finite, singular, not on the curve, or no direction."""
+    """Return the curve with its orientation, the point to start from, the report of its correction, and
+    the faults: not finite, singular, not on the curve, or no direction."""
     x, info = consistent_state(Constraint(curve), 0.0, x0, throw=False)
     along = direction @ jax.lax.stop_gradient(curve.tangent(x))
-    # Perpendicular up to rounding errors of a point that is itself only close to a fold.
+    # Perpendicular up to the rounding errors of a point that is itself only near a fold.
     blurred = jnp.finfo(x.dtype).eps ** 0.5 * jnp.sqrt(jnp.sum(direction**2))
     faults = [~jnp.isfinite(info.residual), ~info.full_rank, ~info.success]
     faults = jnp.stack([*faults, ~(jnp.abs(along) > blurred)])
@@ -93,7 +92,7 @@ def follow(
     solver: dfx.AbstractSolver,
     options: dict[str, Any],
 ) -> tuple[dfx.Solution, Nodes]:
-    """`dx/ds = tau(x)`: values at the arclengths, and the steps."""
+    """Solve `dx/ds = tau(x)`; return the values at the arclengths, and the steps."""
 
     def node(s: Any, x: Float[Array, " k"], args: Any) -> Nodes:
         return without_derivative(Nodes(s, x, curve.tangent(x)))
@@ -113,10 +112,10 @@ def follow(
 def unbroken(
     nodes: Nodes, rtol: RealScalarLike, atol: RealScalarLike
 ) -> tuple[IntScalar, BoolScalar]:
-    """How many nodes belong to one smooth curve, and whether that is all of them.
+    """Return how many nodes belong to one smooth curve, and whether all of them do.
 
-    Near a crossing the steps become as small as the tolerances allow, and the next one may
-    end on any of the branches: with the tangent reversed or turned.
+    Near a crossing the steps become as small as the tolerances allow, and the next one may end on any
+    of the branches: with the tangent reversed or turned.
     """
     used = jnp.isfinite(nodes.s)
     tolerance = atol + rtol * jnp.max(jnp.abs(nodes.x), axis=1)

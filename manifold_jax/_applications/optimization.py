@@ -41,7 +41,7 @@ _MESSAGES = (
 
 
 class ConstrainedMinimum(eqx.Module):
-    """Where a [`gradient_flow`][] ended, and whether that is a minimum.
+    """The end of a [`gradient_flow`][], and whether it is a minimum.
 
     With `G = dg/dx` and the Lagrangian `L(x, lambda) = f(x) + lambda . g(x)`:
 
@@ -99,9 +99,8 @@ def gradient_flow(
     `x' = -P(x) grad f(x)`,  `P = I - G^T (G G^T)^-1 G`,  `G = dg/dx`,
 
     on the manifold from `x0` to a stationary point, then by Newton's method on
-    `grad f + G^T lambda = 0`, `g = 0` to round-off. `f` never increases on the way and every
-    point is feasible, so that (up to the error of the steps) the minimum is the one whose
-    basin `x0` is in.
+    `grad f + G^T lambda = 0`, `g = 0` to round-off. `f` never increases on the way and every point is
+    feasible, so that (up to the error of the steps) the minimum is the one whose basin `x0` is in.
 
     The derivative with respect to `args`, and to everything that `objective` and `constraint` hold
     or close over, is that of the stationary point itself (implicit function), exact in forward and
@@ -139,9 +138,8 @@ def gradient_flow(
     a quasi-Newton method (SciPy's SLSQP, IPOPT) where many variables (thousands) make
     Hessians too large; they may end in another basin, and are not differentiable.
 
-    Source: Sudarsan & Keerthi, Appl. Math. Comput. 92 (1998) 153-193, section 2.2 (d);
-    Tanabe, J. Optim. Theory Appl. 30 (1980) 333-359; Yamashita, Math. Program. 18 (1980)
-    155-168.
+    Source: Sudarsan & Keerthi, Appl. Math. Comput. 92 (1998) 153-193, section 2.2 (d); Tanabe, J.
+    Optim. Theory Appl. 30 (1980) 333-359; Yamashita, Math. Program. 18 (1980) 155-168.
     """
     check_state(x0, "x0")
     x0 = jtu.tree_map(jnp.asarray, x0)
@@ -176,7 +174,7 @@ def gradient_flow(
 
 
 def _start_faults(lagrangian: Lagrangian, start: Float[Array, " n"]) -> Bool[Array, " 4"]:
-    """Which of `_MESSAGES` apply to the start."""
+    """Return which of `_MESSAGES` apply to the start."""
     G, factorization = lagrangian.normals(start)
     level = jnp.max(jnp.abs(lagrangian.g(start)) / row_scale(G, start))
     value, slope = jax.value_and_grad(lagrangian.f)(start)
@@ -184,7 +182,7 @@ def _start_faults(lagrangian: Lagrangian, start: Float[Array, " n"]) -> Bool[Arr
         [
             ~(jnp.isfinite(level) & jnp.all(jnp.isfinite(G))),
             ~(jnp.isfinite(value) & jnp.all(jnp.isfinite(slope))),
-            ~factorization.full_rank,
+            ~factorization.usable,
             level > NewtonProjection().tolerance_for(start.dtype),
         ]
     )
@@ -198,9 +196,9 @@ def _descend(
     tolerance: float,
     options: dict[str, Any],
 ) -> tuple[dfx.Solution, FloatScalar]:
-    """Follow the projected gradient; also the typical size of the gradient."""
+    """Follow the projected gradient; return the typical size of the gradient, too."""
     largest = lambda v: jnp.max(jnp.abs(v))
-    # A start at which `grad f` itself is (nearly) zero leaves its rounding errors as scale.
+    # If `grad f` is (nearly) zero at the start, only its rounding errors would be left as the scale.
     bend = jnp.max(jnp.sum(jnp.abs(jax.hessian(lagrangian.f)(start)), axis=1))
     rounding = 10 * jnp.finfo(start.dtype).eps * bend * (largest(start) + 1)
     size = jnp.maximum(largest(jax.grad(lagrangian.f)(start)), rounding / tolerance)

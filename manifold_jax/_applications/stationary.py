@@ -17,8 +17,8 @@ from .._linalg.pivoted import factorize_by_reduction
 class Lagrangian(eqx.Module):
     """`L(x, lambda) = f(x) + lambda . g(x)`, for vectors.
 
-    What the user's functions close over are leaves, so that it can be differentiated or
-    held fixed.
+    Closed-over arrays of the user's functions are leaves, so that it can be differentiated or held
+    fixed.
     """
 
     objective: Callable
@@ -35,14 +35,14 @@ class Lagrangian(eqx.Module):
         return self.f(x) + multipliers @ self.g(x)
 
     def normals(self, x: Float[Array, " n"]) -> tuple[Float[Array, "m n"], Factorization]:
-        """`G = dg/dx` and the factors of `G G^T`."""
+        """Return `G = dg/dx` and the factors of `G G^T`."""
         _, G = jacobian(self.g, x)
         return G, factorize(gram(G, G))
 
     def projected_gradient(
         self, x: Float[Array, " n"]
     ) -> tuple[Float[Array, " n"], Float[Array, " m"]]:
-        """`P grad f = grad f + G^T lambda` and `lambda`, `P = I - G^T (G G^T)^-1 G`."""
+        """Return `P grad f = grad f + G^T lambda` and `lambda`, `P = I - G^T (G G^T)^-1 G`."""
         G, factorization = self.normals(x)
         gradient = jax.grad(self.f)(x)
         multipliers = -factorization.solve(G @ gradient)
@@ -51,11 +51,11 @@ class Lagrangian(eqx.Module):
     def curvature(
         self, x: Float[Array, " n"], multipliers: Float[Array, " m"]
     ) -> tuple[FloatScalar, FloatScalar]:
-        """Smallest eigenvalue of the Hessian of `L` on the tangent space, and the size of
+        """Return the smallest eigenvalue of the Hessian of `L` on the tangent space, and the size of
         that Hessian, its largest absolute row sum.
 
-        The normal space is moved to the far end of the spectrum. Unlike with a basis of the
-        tangent space, everything can be differentiated.
+        The normal space is moved to the far end of the spectrum. Unlike with a basis of the tangent
+        space, everything can be differentiated.
         """
         G, factorization = self.normals(x)
         H = jax.hessian(self)(x, multipliers)
@@ -90,16 +90,15 @@ class _Conditions(AbstractEquations):
 def stationary_point(
     lagrangian: Lagrangian, near: Float[Array, " n"], reach: FloatScalar, size: FloatScalar
 ) -> tuple[Float[Array, " n"], Float[Array, " m"], FloatScalar, BoolScalar]:
-    """The point at which the first order conditions hold, with its derivative; its multipliers and
-    curvature, and whether it is a minimum.
+    """Return the point at which the first order conditions hold, with its derivative, its multipliers
+    and curvature, and whether it is a minimum.
 
-    Newton's method from `near`, which must be good already: a result that is further away
-    than `reach (|x| + 1)` belongs to another basin, and `near` is kept.
+    Newton's method from `near`, which must already be close: a result that is further away than
+    `reach (|x| + 1)` belongs to another basin, and `near` is kept.
 
-    It is a strict minimum if the curvature is positive, beyond rounding errors and without
-    much change over the distance to which the point is known, two steps of Newton's method
-    from `near`. (Where the curvature vanishes at the stationary point itself, a step leads
-    only part of the way there.)
+    It is a strict minimum if the curvature is positive, beyond rounding errors and without much change
+    over the distance to which the point is known, two steps of Newton's method from `near`. (Where the
+    curvature vanishes at the stationary point itself, a step leads only part of the way there.)
 
     **Arguments:**
 

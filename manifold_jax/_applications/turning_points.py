@@ -1,4 +1,4 @@
-"""Where a curve turns back in one coordinate: found between the steps, then located."""
+"""Turning points of a curve in one coordinate: found between the steps, then located."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -31,14 +31,14 @@ def find_turns(
     component: int,
     size: int,
 ) -> Turns:
-    """The sign changes of one tangent component along `path`, between the first `used` nodes.
+    """Find the sign changes of one tangent component along `path`, between the first `used` nodes.
 
-    All of `path` is on the curve to round-off, so the point at which the component vanishes
-    is the turning point to round-off, whatever the error of its arclength. The derivative is
-    that of one step of Newton's method there.
+    All of `path` is on the curve to round-off, so the point at which the component vanishes is the
+    turning point to round-off, whatever the error of its arclength. The derivative is that of one step
+    of Newton's method there.
     """
     slopes = nodes.tangent[:, component]
-    # The last sign that is not a matter of rounding, as where the trace starts at a fold.
+    # The last sign beyond rounding errors, e.g. where the trace starts at a fold.
     clear = jnp.abs(slopes) > 100 * jnp.finfo(slopes.dtype).eps
     signs = jax.lax.associative_scan(
         lambda last, new: jnp.where(new == 0, last, new), jnp.where(clear, jnp.sign(slopes), 0)
@@ -73,7 +73,7 @@ def _bracketed_root(
     ends: tuple[FloatScalar, FloatScalar],
     values: tuple[FloatScalar, FloatScalar],
 ) -> FloatScalar:
-    """A root between two ends at which the signs differ, by a regula falsi of order 1.7.
+    """Find a root between two ends at which the signs differ, by a regula falsi of order 1.7.
 
     Source: Anderson & Bjorck, BIT 13 (1973) 253-264.
     """

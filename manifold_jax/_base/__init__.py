@@ -1,1 +1,1 @@
-"""Names that all other folders use: types, what is taken from Diffrax, errors, derivative rules."""
+"""Shared by all other folders: types, private names of Diffrax, errors, derivative rules."""

@@ -1,4 +1,4 @@
-"""Functions whose closed-over arrays are leaves."""
+"""Functions whose closed-over arrays are leaves of a pytree."""
 
 from collections.abc import Callable
 from typing import Any
@@ -11,7 +11,7 @@ from jax.extend.core import ClosedJaxpr, Jaxpr, jaxpr_as_fun
 
 
 class ConvertedClosure(eqx.Module):
-    """What [`convert_closure`][] returns."""
+    """A function with closed-over arrays as leaves, made by [`convert_closure`][]."""
 
     constants: list[Any]
     jaxpr: Jaxpr  # a leaf, not static, so that conversions of two functions have one structure
@@ -33,10 +33,10 @@ class ConvertedClosure(eqx.Module):
 
 
 def convert_closure(function: Callable, *examples: Any) -> Callable:
-    """`function` with the arrays that it closes over as leaves, so that they are differentiated
-    where it is passed on. It can then be called with arguments like the examples.
+    """Return `function` with the arrays that it closes over as leaves, so that they are
+    differentiated where it is passed on. It can then be called with arguments like the examples.
 
-    `eqx.filter_closure_convert` also asks for the same mesh axes that arguments vary over, which
+    `eqx.filter_closure_convert` requires arguments to vary over the same mesh axes as well, which
     inside `jax.pmap` and `jax.shard_map` differ between the first step and the next.
     """
     arrays, static = eqx.partition(examples, _is_example)

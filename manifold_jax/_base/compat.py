@@ -9,11 +9,11 @@ import equinox as eqx
 import jax.tree_util as jtu
 from diffrax import AbstractTerm, MultiTerm, RESULTS
 from diffrax._heuristics import (
-    is_sde as is_sde,  # which terms are driven by Brownian motion
-    is_unsafe_sde as is_unsafe_sde,  # by one that cannot be evaluated twice
+    is_sde as is_sde,  # whether terms are driven by Brownian motion
+    is_unsafe_sde as is_unsafe_sde,  # whether by one that cannot be evaluated twice
 )
 from diffrax._integrate import (
-    loop as diffrax_loop,  # what an adjoint has to run  # noqa: F401
+    loop as diffrax_loop,  # the loop that an adjoint runs  # noqa: F401
     SaveState as SaveState,  # what has been saved so far
     State as LoopState,  # what a solve carries from step to step
 )
@@ -53,54 +53,55 @@ def time_direction(terms: PyTree) -> RealScalarLike:
 
 
 def directed(terms: PyTree, direction: RealScalarLike) -> PyTree:
-    """Terms in the time in which Diffrax integrates, `t * direction`."""
+    """Return the terms in the time in which Diffrax integrates, `t * direction`."""
     is_leaf = lambda x: isinstance(x, AbstractTerm) and not isinstance(x, MultiTerm)
     return jtu.tree_map(lambda term: WrapTerm(term, direction), terms, is_leaf=is_leaf)  # pyright: ignore[reportArgumentType]
 
 
 def undirected(terms: PyTree) -> PyTree:
-    """Terms as the user wrote them, if Diffrax has wrapped them."""
+    """Return the terms as the user wrote them, without the wrapper for negated time."""
     return terms.term if isinstance(terms, WrapTerm) else terms
 
 
 def nonlinear_failure() -> RESULTS:
-    """The result code of a constraint that could not be satisfied.
+    """Return the result code for a constraint that could not be satisfied.
 
-    Result codes cannot be added from outside Diffrax; this is what its implicit solvers
+    Result codes cannot be added from outside Diffrax; this is the one that its implicit solvers
     return when their equations cannot be solved.
     """
     return RESULTS.nonlinear_divergence  # pyright: ignore[reportReturnType]
 
 
 def number_of_result(result: RESULTS) -> Any:
-    """The number by which a result code is stored."""
+    """Return the number by which a result code is stored."""
     return result._value  # pyright: ignore
 
 
 def messages_of_results() -> list[str]:
-    """The messages of all result codes, by number."""
+    """Return the messages of all result codes, by number."""
     return list(RESULTS._index_to_message)  # pyright: ignore
 
 
 def save_states(state: LoopState) -> list[SaveState]:
-    """What a solve has saved so far, one per `SubSaveAt`."""
+    """Return what a solve has saved so far, one state per `SubSaveAt`."""
     is_save_state = lambda x: isinstance(x, SaveState)
     leaves = jtu.tree_leaves(state.save_state, is_leaf=is_save_state)
     return [leaf for leaf in leaves if is_save_state(leaf)]
 
 
 def with_result(state: LoopState, result: RESULTS) -> LoopState:
-    """A solve that ends with this result before its next step, unless it is "successful"."""
+    """Return the state of a solve that ends with this result before its next step, if it is a failure."""
     return eqx.tree_at(lambda s: s.result, state, update_result(state.result, result))
 
 
 def with_next_time(state: LoopState, tnext: Any) -> LoopState:
-    """A solve whose next step ends there."""
+    """Return the state of a solve whose next step ends at `tnext`."""
     return eqx.tree_at(lambda s: s.tnext, state, tnext)
 
 
 class Progress(NamedTuple):
-    """How far a solve is: where its next step begins and ends, from what, and how many there were."""
+    """The progress of a solve: where its next step begins and ends, from which state, and the
+    numbers of steps so far."""
 
     tprev: Any
     tnext: Any
@@ -116,7 +117,7 @@ class Progress(NamedTuple):
 
 
 class Ending(NamedTuple):
-    """How a solve ended."""
+    """The end of a solve."""
 
     event_mask: Any
     save_state: Any
@@ -131,7 +132,7 @@ class Ending(NamedTuple):
 
 
 class LastStep(NamedTuple):
-    """The step in which an event happened, with the conditions behind it."""
+    """The step in which an event happened, and the values of the conditions after it."""
 
     start: Any
     end: Any
@@ -146,8 +147,7 @@ class LastStep(NamedTuple):
 
 
 class Differentiable(NamedTuple):
-    """What has derivatives of the final state of a loop: not its statistics, and not the state of
-    the step size controller."""
+    """The differentiable part of the final state of a loop: no statistics, no controller state."""
 
     ts: list[Any]
     ys: list[Any]
@@ -175,9 +175,8 @@ class Differentiable(NamedTuple):
 
 
 def scan_counts(equation: Any) -> tuple[int, int]:
-    """Return, of a traced `lax.scan`, how many of its inputs are constants and how many are
-    carried. JAX 0.12 has no
-    parameters that say so; what is scanned over has one axis less in the body."""
+    """Return the numbers of constants and of carried values among the inputs of a traced `lax.scan`.
+    JAX 0.12 has no parameters for them; scanned arrays have one axis less in the body."""
     body = getattr(equation.params["jaxpr"], "jaxpr", equation.params["jaxpr"])
     scanned = lambda outer, inner: sum(
         a.aval.ndim > b.aval.ndim for a, b in zip(outer, inner, strict=True)

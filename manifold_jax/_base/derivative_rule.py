@@ -1,9 +1,9 @@
-"""Functions with a derivative rule of their own, of which derivatives of any order are right.
+"""Functions with their own derivative rule, correct for derivatives of any order.
 
-`jax.custom_jvp` forgets its rule where JAX evaluates a loop partially, as reverse mode does with
-`lax.scan`: the first derivative still follows the rule, but a second one differentiates the function
-itself (seen with JAX 0.10.2 and 0.12.0: a root that is found under `stop_gradient` has then none).
-An operation of its own keeps the rule through every transformation.
+`jax.custom_jvp` loses its rule where JAX evaluates a loop partially, as reverse mode does with
+`lax.scan`: the first derivative still follows the rule, but the second one differentiates the
+function itself (seen with JAX 0.10.2 and 0.12.0: a root that is found under `stop_gradient` then
+has none). A primitive keeps its rule through every transformation.
 """
 
 from collections.abc import Callable
@@ -26,9 +26,9 @@ class ForwardRule:
         @function.define_jvp
         def rule(values, primals, tangents): ...
 
-    `values` is what the function returns at `primals`; `rule` returns its tangents. Of leaves that
-    are not differentiated, or not real numbers, tangents are `None`, in both directions. Reverse mode
-    transposes the rule. All arrays must be in the arguments, none closed over.
+    `values` is what the function returns at `primals`; `rule` returns its tangents. Tangents are
+    `None`, in both directions, for leaves that are not differentiated or are not real numbers.
+    Reverse mode transposes the rule. All arrays must be in the arguments, none closed over.
     """
 
     def __init__(self, function: Callable):
@@ -67,7 +67,7 @@ class ForwardRule:
         return eqx.combine(jtu.tree_unflatten(outputs, out), out_static)
 
 
-# The operation: `call_jaxpr` is evaluated, `rule(values, primals, tangents)` is its derivative.
+# The primitive: evaluates `call_jaxpr`; its derivative is `rule(values, primals, tangents)`.
 _ruled = Primitive("call_with_derivative_rule")
 _ruled.multiple_results = True
 
@@ -95,7 +95,7 @@ def _differentiate(primals: Any, tangents: Any, *, call_jaxpr: Any, rule: Callab
 
 
 def _as_array(x: Any) -> Any:
-    """Also of the literals of a traced function, which may be numbers."""
+    """Convert also the literals of a traced function, which may be Python's numbers."""
     return jnp.asarray(x, getattr(x, "dtype", None))
 
 
@@ -119,11 +119,11 @@ def _batch(primals: Any, axes: Any, *, call_jaxpr: Any, rule: Callable) -> tuple
 def apply_linear(
     forward: Callable, transpose: Callable, like: Any, primals: Any, tangents: Any
 ) -> Any:
-    """`forward(primals, tangents)`, linear in the tangents, with `transpose(primals, cotangents)`
-    as what reverse mode does instead of transposing it operation by operation.
+    """Return `forward(primals, tangents)`, which is linear in the tangents; reverse mode calls
+    `transpose(primals, cotangents)` instead of transposing it operation by operation.
 
-    Tangents and cotangents are `None` where there are none. What is returned looks like the
-    arrays `like`; neither function is traced before it is needed.
+    Tangents and cotangents are `None` where there are none. The result has the structure and shapes
+    of `like`; neither function is traced before it is needed.
     """
     (primal_leaves, in_tree), (tangent_leaves, along) = map(jtu.tree_flatten, (primals, tangents))
     like_leaves, out_tree = jtu.tree_flatten(like)
@@ -148,7 +148,7 @@ def apply_linear(
     return jtu.tree_unflatten(out_tree, out)
 
 
-# The operation: `forward(primals, tangents)`.
+# The primitive: `forward(primals, tangents)`.
 _linear = Primitive("linear_with_transpose_rule")
 _linear.multiple_results = True
 

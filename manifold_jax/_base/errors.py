@@ -1,4 +1,4 @@
-"""What a user reads of an error that occurs while a compiled function runs."""
+"""Readable messages for errors that occur while a compiled function runs."""
 
 import functools
 import inspect
@@ -13,9 +13,9 @@ Function = TypeVar("Function", bound=Callable)
 
 
 def clear_errors(function: Function) -> Function:
-    """Wrap a function made by `equinox.filter_jit`: the message of an error comes last, where it
-    is looked for, a call with the wrong arguments is told the right ones, and an ensemble that is
-    differentiated forwards what to write for that."""
+    """Wrap a function made by `equinox.filter_jit`. The message of an error comes last, where it is
+    looked for; a call with wrong arguments is told the signature; for an ensemble differentiated in
+    forward mode the message says what to write."""
     signature, name = inspect.signature(function), getattr(function, "__name__", "")
 
     @functools.wraps(function)
@@ -31,7 +31,7 @@ def clear_errors(function: Function) -> Function:
                 raise TypeError(_FORWARDS) from error
             raise
 
-    return cast(Function, call)  # an editor sees the arguments
+    return cast(Function, call)  # editors show the arguments
 
 
 _FORWARDS = (
@@ -45,7 +45,7 @@ def _is_reverse(parameters: Any, kwargs: Any) -> bool:
 
 
 def _message_last(text: str) -> str:
-    """Return the message without the advice on debugging that Equinox puts behind the message."""
+    """Return the message without the advice on debugging that Equinox appends."""
     stack, found, rest = text.rpartition("equinox.EquinoxRuntimeError: ")
     message, _, _ = rest.partition("\n-------------------\n")
     return f"{stack}\n{message.strip()}" if found else text
@@ -60,7 +60,7 @@ def _check_call(name: str, signature: inspect.Signature, args: Any, kwargs: Any)
 
 
 def refuse_old_names(**names: str) -> Callable[[Function], Function]:
-    """A decorator: arguments that were renamed raise, and say their new name, `old="new"`."""
+    """Return a decorator that makes renamed arguments raise with their new name, `old="new"`."""
 
     def decorate(function: Function) -> Function:
         @functools.wraps(function)

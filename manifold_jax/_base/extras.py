@@ -1,11 +1,11 @@
-"""Packages that only an extra of this one installs, and a bar on a terminal for those who have rich."""
+"""Packages of optional extras, and a progress bar on terminals for users who have rich."""
 
 import importlib.util
 from typing import Any
 
 
 class NoBar:
-    """A stand-in for a bar, where lines are printed or nothing is."""
+    """A stand-in for a progress bar: prints lines, or nothing."""
 
     def add_task(self, *_: Any, **__: Any) -> int:
         return 0
@@ -24,8 +24,8 @@ class NoBar:
 
 
 def terminal_bar(shown: bool, text: str, remaining: bool = False) -> Any:
-    """A `rich.progress.Progress` with a description, a bar, `text` and the time gone by (and that
-    which remains) if the output is a terminal and rich is installed, else a [`NoBar`][]."""
+    """Return a `rich.progress.Progress` with a description, a bar, `text`, and the elapsed and
+    remaining time if the output is a terminal and rich is installed, else a [`NoBar`][]."""
     try:
         from rich.console import Console
         from rich.progress import (
@@ -47,7 +47,7 @@ def terminal_bar(shown: bool, text: str, remaining: bool = False) -> Any:
 
 
 def print_line(bar: Any, text: str) -> None:
-    """A line of its own, above the bar if there is one."""
+    """Print a line, above the bar if there is one."""
     if isinstance(bar, NoBar):
         print(text, flush=True)
     else:
@@ -55,7 +55,7 @@ def print_line(bar: Any, text: str) -> None:
 
 
 def require(module: str, extra: str, what: str) -> None:
-    """Raise with what to install where `module` is missing."""
+    """Raise an error that says what to install if `module` is missing."""
     if importlib.util.find_spec(module) is None:
         raise ImportError(
             f"{what} needs {module}, which is not installed: `pip install {module}`, or install "

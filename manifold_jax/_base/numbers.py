@@ -1,4 +1,4 @@
-"""Python's numbers among the arguments of functions that are compiled."""
+"""Python's numbers among the arguments of compiled functions."""
 
 import functools
 import inspect
@@ -16,9 +16,9 @@ Function = TypeVar("Function", bound=Callable)
 
 
 def numbers_as_arrays(*names: str, times: tuple[str, ...] = ()) -> Callable[[Function], Function]:
-    """Wrap a function made by `equinox.filter_jit`, for which every other number is another
-    program: those in the arguments with these names become arrays, weakly typed as Python's numbers
-    are. Whole numbers, which may be shapes or exponents, stay what they are, but for `times`."""
+    """Wrap a function made by `equinox.filter_jit`, which compiles anew for every other value of a
+    Python number: those in the arguments with these names become arrays, weakly typed like Python's
+    numbers. Integers, which may be shapes or exponents, stay as they are, except in `times`."""
 
     def decorate(function: Function) -> Function:
         parameters = list(inspect.signature(function).parameters)
@@ -40,7 +40,7 @@ def numbers_as_arrays(*names: str, times: tuple[str, ...] = ()) -> Callable[[Fun
 
 
 def _checked(name: str, tree: Any) -> Any:
-    """Refuse objects that JAX can neither look into nor compare with those of another call."""
+    """Refuse objects that JAX can neither flatten nor compare with those of another call."""
     for leaf in jtu.tree_leaves(tree):
         if eqx.is_array_like(leaf) or isinstance(leaf, Hashable):
             continue
@@ -53,7 +53,7 @@ def _checked(name: str, tree: Any) -> Any:
 
 
 def with_arrays(tree: Any) -> Any:
-    """`tree` with an array in place of every real or complex number of Python."""
+    """Return `tree` with an array in place of every real or complex number of Python."""
     is_number = lambda x: type(x) in (float, complex)
     return jtu.tree_map(lambda x: _as_array(x) if is_number(x) else x, tree)
 
@@ -63,7 +63,6 @@ def _time_as_array(t: Any) -> Any:
 
 
 def _as_array(number: float | complex) -> Any:
-    """The number itself under `jax.jit`, as it is part of that program anyway, and constants make a
-    better one."""
+    """Keep the number under `jax.jit`: it is part of that program, and constants make a better one."""
     array = jnp.asarray(number)
     return number if isinstance(array, jax.core.Tracer) else array

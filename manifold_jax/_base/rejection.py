@@ -1,4 +1,4 @@
-"""Steps that failed: when they are repeated with a smaller one, and when they end the solve."""
+"""Failed steps: repeated with a smaller step size, or the end of the solve."""
 
 import functools
 
@@ -27,10 +27,10 @@ def is_repeatable(t0: RealScalarLike, t1: RealScalarLike, first_step: FloatScala
 
 
 def rejecting(error: Y, success: BoolScalar, repeatable: BoolScalar) -> Y:
-    """Error estimate of a step that may have failed.
+    """Return the error estimate of a step that may have failed.
 
-    An infinite error makes an adaptive controller reject the step and try a smaller one.
-    Where there is none the step is let through, and its result code ends the solve.
+    An infinite error makes an adaptive controller reject the step and try a smaller one. Without an
+    error estimate the step is accepted, and its result code ends the solve.
     """
     verdict = jnp.where(repeatable, jnp.inf, 0.0)
     return jtu.tree_map(lambda e: jnp.where(success, e, verdict.astype(e.dtype)), error)

@@ -11,6 +11,6 @@ def shapes(tree: Any) -> Any:
 
 
 def are_alike(a: Any, b: Any) -> bool:
-    """Whether the structures are the same, and the shapes of all leaves."""
+    """Whether two pytrees have the same structure and the same shapes."""
     (leaves, structure), (others, other) = map(jtu.tree_flatten, (a, b))
     return structure == other and list(map(jnp.shape, leaves)) == list(map(jnp.shape, others))

@@ -1,8 +1,7 @@
 """Types shared by every module, and the shape letters used in annotations.
 
-Letters: `n` state components, `m` constraints, `d = n - m` the dimension of the
-manifold. `Y` is any pytree of real floating-point arrays; internally a state is
-ravelled once into a vector of shape `(n,)`.
+Letters: `n` state components, `m` constraints, `d = n - m` the dimension of the manifold. `Y` is any
+pytree of real floating-point arrays; internally a state is ravelled once into a vector of shape `(n,)`.
 """
 
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""Functions of the user: refused where they are given, and evaluated once where they depend on `args` alone."""
+"""Functions given by users: checked, and evaluated once where they depend on `args` alone."""
 
 import abc
 import inspect
@@ -12,20 +12,20 @@ from .types import Args
 
 
 class AbstractOfArgs(eqx.Module):
-    """A function of the args alone, called by vector fields and constraints in every evaluation."""
+    """A function of `args` alone, called by vector fields and constraints in every evaluation."""
 
     function: eqx.AbstractVar[Callable]
 
     @abc.abstractmethod
     def __call__(self, args: Args) -> Any:
-        """The same for the same args."""
+        """Return the value, which depends on nothing else."""
 
 
 def evaluated(tree: Any, args: Args) -> Any:
-    """`tree` with every [`AbstractOfArgs`][] in it replaced by its value at these args. Inside a loop
-    it would be part of every program that needs it: of stages, corrections and their derivatives.
+    """Return `tree` with every [`AbstractOfArgs`][] in it replaced by its value at these `args`.
+    Inside a loop it would be evaluated in every stage, correction and derivative.
 
-    The value is closed over, and so is one input, however often the function is there.
+    The value is closed over, and so is one input, however often the function occurs.
     """
     found: dict[int, Callable] = {}
 
@@ -41,8 +41,8 @@ def evaluated(tree: Any, args: Args) -> Any:
 
 
 def check_function(name: str, function: Any, call: str, *keywords: str, advice: str = "") -> None:
-    """Refuse what cannot be called like `call`, for example `g(t, y, args)`: with that many
-    arguments, and `keywords` for a `**kwargs` at their end."""
+    """Refuse arguments that cannot be called like `call`, for example `g(t, y, args)`: with that many
+    arguments, and `keywords` for a trailing `**kwargs`."""
     if not callable(function):
         advice = f" {advice}" if advice else ""
         raise TypeError(
@@ -50,7 +50,7 @@ def check_function(name: str, function: Any, call: str, *keywords: str, advice: 
         )
     try:
         signature = inspect.signature(function)
-    except (TypeError, ValueError):  # some that are not written in Python have none
+    except (TypeError, ValueError):  # some that are not written in Python have no signature
         return
     arguments = call[call.index("(") + 1 : -1].removesuffix(", **kwargs").split(", ")
     try:

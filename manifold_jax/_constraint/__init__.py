@@ -1,1 +1,1 @@
-"""The constraint of a manifold, the correction onto it, and what is checked and measured of it."""
+"""Constraints, the correction onto their manifold, checks of arguments and measures of violation."""

@@ -1,4 +1,4 @@
-"""States and constraints of the wrong kind or shape, refused while tracing."""
+"""Checks of states and constraints while tracing."""
 
 from typing import Any
 
@@ -58,8 +58,8 @@ def check_constraint_type(constraint: Any) -> None:
 
 
 def has_no_equations(constraint: AbstractConstraint, t: RealScalarLike, y: Y, args: Args) -> bool:
-    """Whether every state satisfies it. Of a constraint that cannot be evaluated
-    [`check_constraint`][] says why."""
+    """Whether every state satisfies the constraint. For a constraint that cannot be evaluated
+    [`check_constraint`][] raises with the reason."""
     try:
         leaves = jtu.tree_leaves(eqx.filter_eval_shape(constraint, t, y, args))
     except Exception:
@@ -68,7 +68,7 @@ def has_no_equations(constraint: AbstractConstraint, t: RealScalarLike, y: Y, ar
 
 
 def check_constraint(constraint: AbstractConstraint, t: RealScalarLike, y: Y, args: Args) -> int:
-    """Refuse, while tracing, constraints of the wrong type or shape; returns `m`."""
+    """Refuse, while tracing, constraints of the wrong type or shape. Returns `m`."""
     check_constraint_type(constraint)
     if isinstance(constraint, NoConstraint):
         return 0

@@ -1,4 +1,4 @@
-"""The manifold `{y : g(t, y, args) = 0}`, and how points are corrected onto it."""
+"""The manifold `{y : g(t, y, args) = 0}`, and the correction of points onto it."""
 
 import abc
 from typing import ClassVar
@@ -24,15 +24,15 @@ class AbstractConstraint(eqx.Module):
     """A manifold given by `m` equations, `g(t, y, args) = 0`.
 
     Implementations have to provide `__call__`, the residual, and `redundant`, whether equations may
-    depend on each other. The rest has defaults for any residual; a manifold with structure
-    replaces what it knows better: how a point is corrected (`correct`), what leads across it
-    (`normals`), the part of a vector along it (`push_forward`), and what a bad start may come from
-    (`faults`).
+    depend on each other. The rest has defaults for any residual; a manifold with more structure
+    overrides what it knows better: how a point is corrected (`correct`), the directions across the
+    manifold (`normals`), the tangential part of a vector (`push_forward`), and the possible causes of a
+    bad start (`faults`).
 
-    All methods are traced: they take the state `y` (any pytree of real arrays, `n` numbers in all)
-    of one trajectory, never a batch, and must work under `jax.jit` and `jax.vmap` (no Python
-    branches on values) and be differentiable in both modes with respect to `y`, `t`, `args` and
-    the module's own arrays. Times are true times also when integrating backwards.
+    All methods are traced: they take the state `y` (any pytree of real arrays, `n` numbers in all) of
+    one trajectory, never a batch, and must work under `jax.jit` and `jax.vmap` (no Python branches on
+    values) and be differentiable in both modes with respect to `y`, `t`, `args` and the module's own
+    arrays. Times are true times also when integrating backwards.
     """
 
     redundant: eqx.AbstractVar[bool]
@@ -63,23 +63,23 @@ class AbstractConstraint(eqx.Module):
         far: bool = False,
         directions: Float[Array, "m k"] | None = None,
     ) -> tuple[Y, ProjectionInfo]:
-        """The point of the manifold to which `y` is moved. By default `p = y + V z`, the root of
-        `g(t, y + V z, args) = 0`, with `V` held at `y`.
+        """Correct a point onto the manifold. By default to `p = y + V z`, with `z` the root of
+        `g(t, y + V z, args) = 0` and `V` held at `y`.
 
         **Arguments:**
 
-        - `projection`: in which norm, with how many iterations and how accurately.
-        - `fallback`: a state at which `g` is finite, `y` by default. A correction that fails has to
-            have its derivative there, finite: the zero cotangent of a rejected step must stay zero.
-        - `far`: the point is not the result of a small step, and may be anywhere.
+        - `projection`: the norm, the number of iterations and the tolerance.
+        - `fallback`: a state at which `g` is finite, `y` by default. The derivative of a failed correction
+            has to be taken there, finite: the zero cotangent of a rejected step must stay zero.
+        - `far`: whether the point may be anywhere, instead of being the result of a small step.
         - `directions`: the rows of `V^T` to correct along, if not those at `y`, from `normals`.
 
         **Returns:**
 
-        `(p, info)`: a point like `y` and what was done. Where `info.success` is false `p` is `y`.
-        On the manifold to rounding already, `y` should stay as it is. The derivative must be that
-        of the map from `(t, y, args)` to `p`, and to first order it must not move points along the
-        manifold: the order of solvers and the error estimates rely on it.
+        `(p, info)`: a point like `y`, and a report. Where `info.success` is false, `p` is `y`. A point
+        that is on the manifold to rounding should stay as it is. The derivative must be that of the map
+        from `(t, y, args)` to `p`, and to first order it must not move points along the manifold: the
+        order of solvers and the error estimates rely on it.
         """
         fallback = y if fallback is None else fallback
         structure = self.structure_at(t, y, args) if directions is None else None
@@ -93,21 +93,20 @@ class AbstractConstraint(eqx.Module):
     def normals(
         self, projection: NewtonProjection, t: RealScalarLike, y: Y, args: Args = None
     ) -> ConstraintNormals:
-        """What leads across the manifold at `y`: `G = dg/dy` and the rows of `V^T = G W^-1`, both
+        """Return the normals of the manifold at `y`: `G = dg/dy` and the rows of `V^T = G W^-1`, both
         `(m, k)`. `k` is `n`, unless components are moved together (positions and velocities)."""
         return equations_of(self, t, y, args, projection, self.redundant).normals()
 
     def structure_at(self, t: RealScalarLike, y: Y, args: Args = None) -> Structure | None:
-        """Return the sparsity structure of `G = dg/dy`, if it is not to be held as an array: for
-        many equations of few unknowns
-        each. Known while tracing."""
+        """Return the sparsity structure of `G = dg/dy` if it is not to be held as an array, for many
+        equations of few unknowns each. Known while tracing."""
         del t, y, args
         return None
 
     def push_forward(
         self, t: RealScalarLike, y: Y, args: Args, directions: Float[Array, "m k"], vector: Y
     ) -> Y:
-        """The derivative of the correction along `directions` at `y` on the manifold, applied to a
+        """Apply the derivative of the correction along `directions`, at `y` on the manifold, to a
         vector: `e - V (G V)^-1 G e`."""
         equations = equations_of(self, t, y, args, NewtonProjection(), self.redundant, directions)
         e, unravel = jfu.ravel_pytree(vector)
@@ -117,9 +116,9 @@ class AbstractConstraint(eqx.Module):
     def faults(
         self, t: RealScalarLike, y: Y, args: Args = None
     ) -> tuple[tuple[BoolScalar, str], ...]:
-        """What else may be wrong with a start that cannot be corrected: whether it is, and a
-        message in which `{y}` stands for the name of the state. The last one that applies is
-        reported, instead of the general ones."""
+        """Return further causes of a start that cannot be corrected, as pairs: whether it applies, and
+        a message in which `{y}` stands for the name of the state. The last one that applies is reported
+        instead of the general ones."""
         del t, y, args
         return ()
 
@@ -153,8 +152,7 @@ class Constraint(AbstractConstraint):
         itself: indices must be NumPy arrays that it closes over, not be in `args`. Sparse equations
         must be independent. [`LocalCoordinates`][] forms dense matrices whatever the structure.
 
-    Use [`Invariants`][] when the constraint is "this quantity keeps its initial
-    value".
+    Use [`Invariants`][] when the constraint is "this quantity keeps its initial value".
     """
 
     function: ResidualFunction
@@ -228,7 +226,7 @@ class Invariants(AbstractConstraint):
 
 
 class NoConstraint(AbstractConstraint):
-    """No equations: the manifold is the whole space."""
+    """The manifold without equations: the whole space."""
 
     redundant: ClassVar[bool] = False
 

@@ -1,7 +1,7 @@
 """Correction of one point onto the manifold of any residual (the paper's perturbation approach).
 
-The corrected point is `p = x + V z` with directions `V` (shape `(n, m)`, held as the rows of `V^T`)
-that are fixed at the point `x` that is corrected, and `z` the root of `g(t, x + V z, args) = 0`.
+The corrected point is `p = x + V z` with directions `V` (shape `(n, m)`, held as the rows of `V^T`),
+fixed at the point `x` that is corrected, and the root `z` of `g(t, x + V z, args) = 0`.
 """
 
 import dataclasses
@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 from .._base.closure import convert_closure
 from .._base.derivative_rule import ForwardRule
 from .._base.types import Args, BoolScalar, FloatScalar, IntScalar, RealScalarLike, Y
-from .._linalg.dense import factorize_once, gram, pseudo_invert
+from .._linalg.dense import DEPENDENCE_THRESHOLD, factorize_once, gram, pseudo_invert
 from .._linalg.newton import AbstractEquations, chord, damped_newton, implicit_tangent
 from .._linalg.rows import AbstractRows, combine, directions_of, InverseWeights, Rows
 from .._linalg.sparse import SparseRows, Structure
@@ -25,9 +25,9 @@ from .settings import NewtonProjection
 
 
 class ConstraintNormals(NamedTuple):
-    """What leads across the manifold at a point: the Jacobian `G`, and the directions, the rows of
-    `V^T`, along which points nearby are corrected, by default `V = W^-1 G^T`. Both `(m, k)` for
-    `k` components that are moved together, by default the `n` of the state."""
+    """The normals of a manifold at a point: the Jacobian `G`, and the directions, the rows of `V^T`,
+    along which points nearby are corrected, by default `V = W^-1 G^T`. Both `(m, k)` for `k` components
+    that are moved together, by default the `n` of the state."""
 
     jacobian: Rows
     directions: Rows
@@ -37,13 +37,15 @@ class FactoredGram(NamedTuple):
     """The normals at a point with `G V` factored: the linearization of a correction."""
 
     normals: ConstraintNormals
-    factorization: Any  # Factorization | Inverse, or that of sparse rows
+    factorization: Any  # Factorization, Inverse or BlockFactorization
 
     @staticmethod
     def of(
-        normals: ConstraintNormals, redundant: bool, dependent: FloatScalar | float = 1e-4
+        normals: ConstraintNormals,
+        redundant: bool,
+        dependent: FloatScalar | float = DEPENDENCE_THRESHOLD,
     ) -> "FactoredGram":
-        """`dependent` as in `pseudo_invert`, for `redundant` equations."""
+        """Factor `G V`; `dependent` as in `pseudo_invert`, for `redundant` equations."""
         if isinstance(normals.jacobian, AbstractRows):
             return FactoredGram(normals, normals.jacobian.factorize(normals.directions))
         A = gram(*normals)
@@ -55,8 +57,19 @@ class FactoredGram(NamedTuple):
         return self.factorization.solve(b)
 
 
-def _dependent(ratio: FloatScalar) -> FloatScalar:
-    return jax.lax.stop_gradient(jnp.clip(ratio, 1e4 * jnp.finfo(ratio.dtype).eps, 1e-4))
+# Redundant equations depend on each other on the manifold. At a distance `d` from it (a scaled
+# residual) their gradients differ from dependent ones by up to this many times `d`, and so do the
+# entries of `G V` of two points that far apart: eigenvalues of `G V` that vanish on the manifold become
+# O(d) of the largest. Those of the Gram matrix `G W^-1 G^T` of one point are squares of singular
+# values, O(d^2).
+_PERTURBATION = 1e3
+
+
+def dependence_threshold(ratio: FloatScalar) -> FloatScalar:
+    """Return the fraction of the largest eigenvalue below which others count as zero, where those of
+    dependent equations reach `ratio` of it: above rounding, and at most the default of `pseudo_invert`."""
+    smallest = 1e4 * jnp.finfo(ratio.dtype).eps
+    return jax.lax.stop_gradient(jnp.clip(ratio, smallest, DEPENDENCE_THRESHOLD))
 
 
 class CorrectionEquations(AbstractEquations):
@@ -76,7 +89,7 @@ class CorrectionEquations(AbstractEquations):
         return self.function(self.t, x, self.args)
 
     def point(self, z: Float[Array, " m"]) -> Float[Array, " n"]:
-        """`x + V z` without forming `V`, so that its derivative does not either."""
+        """Return `x + V z` without forming `V`, so that its derivative does not either."""
         if self.directions is not None:
             return self.x + combine(z, self.directions)
         _, pullback = jax.vjp(self.residual, self.x)
@@ -91,16 +104,19 @@ class CorrectionEquations(AbstractEquations):
         if self.directions is not None:
             return FactoredGram.of(ConstraintNormals(G, self.directions), self.redundant)
         at_start = self.normals()
-        # `G V` of two points, whose dependence differs by the distance between them.
-        dependent = _dependent(1e3 * self.level(at_start)) if self.redundant else 0.0
-        return FactoredGram.of(ConstraintNormals(G, at_start.directions), self.redundant, dependent)
+        normals = ConstraintNormals(G, at_start.directions)
+        if not self.redundant:
+            return FactoredGram.of(normals, False)
+        dependent = dependence_threshold(_PERTURBATION * self.scaled_residual(at_start))
+        return FactoredGram.of(normals, True, dependent)
 
     def factored(self) -> FactoredGram:
         """Factor the Gram matrix at the point that is corrected."""
         normals = self.normals()
-        # Equations that depend on each other on the manifold do so off it up to the distance.
-        dependent = _dependent(1e6 * self.level(normals) ** 2) if self.redundant else 0.0
-        return FactoredGram.of(normals, self.redundant, dependent)
+        if not self.redundant:
+            return FactoredGram.of(normals, False)
+        dependent = dependence_threshold((_PERTURBATION * self.scaled_residual(normals)) ** 2)
+        return FactoredGram.of(normals, True, dependent)
 
     def normals(self) -> ConstraintNormals:
         G = self._rows(self.x)
@@ -115,8 +131,9 @@ class CorrectionEquations(AbstractEquations):
             return jacobian(self.residual, x)[1]
         return SparseRows(self.function, self.t, x, self.args, self.structure)
 
-    def level(self, normals: ConstraintNormals) -> FloatScalar:
-        """How far from the manifold the point is."""
+    def scaled_residual(self, normals: ConstraintNormals) -> FloatScalar:
+        """Return the largest component of the residual, relative to its typical size: to leading
+        order the distance from the manifold as a fraction of the size of the state."""
         return jnp.max(jnp.abs(self.residual(self.x)) / row_scale(normals.jacobian, self.x))
 
     def starting_at(self, x: Float[Array, " n"]) -> "CorrectionEquations":
@@ -127,7 +144,7 @@ class CorrectionEquations(AbstractEquations):
 
 
 class CorrectionRoot(NamedTuple):
-    """The corrected point, its multipliers, and how it went."""
+    """The corrected point, its multipliers, and a report of the iteration."""
 
     p: Float[Array, " n"]
     z: Float[Array, " m"]
@@ -144,10 +161,10 @@ def solve_correction(
     far: bool,
     factored: FactoredGram | None = None,
 ) -> CorrectionRoot:
-    """The root that the settings in `projection` lead to.
+    """Find the root with the settings in `projection`.
 
-    The derivative of a failed correction is taken at `safe`. Corrections that share a
-    Jacobian and its factorization pass them on as `factored`.
+    The derivative of a failed correction is taken at `safe`. Corrections that share a Jacobian and its
+    factorization pass them on as `factored`.
     """
     if projection.max_steps == 1 and not far:
         return _correct_once(equations, safe, factored)
@@ -158,7 +175,7 @@ def solve_correction(
 def _correct_once(
     equations: CorrectionEquations, safe: Float[Array, " n"], factored: FactoredGram | None
 ) -> CorrectionRoot:
-    """One Newton step, `x - V (G V)^-1 g(x)`, successful if it lowers the residual.
+    """Make one Newton step, `x - V (G V)^-1 g(x)`, successful if it lowers the residual.
 
     Differentiated as it stands: it is a map of its own, not an approximation of the root.
     """
@@ -173,11 +190,11 @@ def _correct_once(
     p = equations.x + combine(z, directions)
     before, after = (jnp.max(jnp.abs(x) / scale) for x in (r, equations.residual(p)))
     rounding = 50 * jnp.finfo(r.dtype).eps
-    success = finite & factorization.full_rank & (after <= jnp.maximum(before, rounding))
+    success = finite & factorization.usable & (after <= jnp.maximum(before, rounding))
     p = jnp.where(success, p, equations.x)
     residual = jnp.where(finite, after, jnp.nan)
     one = jnp.ones((), jnp.int32)
-    return CorrectionRoot(p, z, one, residual, factorization.full_rank, success)
+    return CorrectionRoot(p, z, one, residual, factorization.usable, success)
 
 
 @ForwardRule
@@ -199,10 +216,10 @@ def _solve(
         root = damped_newton(fixed, z, r, scale, max_steps, tolerance)
     else:
         root = chord(fixed, factored, z, r, scale, max_steps)
-    full_rank = factorization.full_rank
-    success = (root.level <= tolerance) & full_rank
+    full_rank = factorization.usable
+    success = (root.scaled_residual <= tolerance) & full_rank
     p = jnp.where(success, fixed.point(root.z), equations.x)
-    return CorrectionRoot(p, root.z, root.iterations, root.level, full_rank, success)
+    return CorrectionRoot(p, root.z, root.iterations, root.scaled_residual, full_rank, success)
 
 
 @_solve.define_jvp
@@ -227,10 +244,10 @@ def equations_of(
     directions: Float[Array, "m n"] | None = None,
     structure: Structure | None = None,
 ) -> CorrectionEquations:
-    """Those of the residual `function(t, y, args)` of a whole state."""
+    """Return the equations for the residual `function(t, y, args)` of a whole state."""
     x, unravel = jfu.ravel_pytree(y)
     t = as_time(t, x.dtype)
-    # Parameters that the residual closes over become inputs, so that they are differentiated.
+    # Closed-over parameters of the residual become inputs, so that they are differentiated.
     residual = convert_closure(
         lambda t, x, args: residual_vector(function, t, unravel(x), args), t, x, args
     )
@@ -244,5 +261,5 @@ def without_normal_part(
     rate: Float[Array, " m"],
     redundant: bool = False,
 ) -> Float[Array, " k"]:
-    """`e - V (G V)^-1 rate`, tangent if `rate = G e`."""
+    """Return `e - V (G V)^-1 rate`, which is tangent if `rate = G e`."""
     return e - combine(FactoredGram.of(normals, redundant).solve(rate), normals.directions)

@@ -1,4 +1,4 @@
-"""Why a point could not be moved onto the manifold."""
+"""Messages for points that could not be moved onto the manifold."""
 
 from typing import Any, NamedTuple
 
@@ -11,7 +11,7 @@ from .constraint import AbstractConstraint
 from .projection_info import ProjectionInfo
 
 
-NOT_THERE = 3  # the message for a state that may not be moved
+NOT_THERE = 3  # number of the message for a state that may not be moved
 NOT_FINITE = 4
 
 _MESSAGES = (
@@ -29,7 +29,7 @@ _MESSAGES = (
 
 
 class Diagnosis(NamedTuple):
-    """Why points of a constraint could not be used: the number of a message, and all of them."""
+    """The number of the message that applies to a point, and all messages."""
 
     cause: IntScalar
     messages: tuple[str, ...]
@@ -38,8 +38,8 @@ class Diagnosis(NamedTuple):
     def of_start(
         constraint: AbstractConstraint, t: RealScalarLike, y: Y, args: Args, info: ProjectionInfo
     ) -> "Diagnosis":
-        """What applies if a correction of `y` failed with this outcome."""
-        # Infinite is the residual of an equation that is scaled by a gradient of zero.
+        """Choose the message for a correction of `y` that failed with the report `info`."""
+        # The residual is infinite for an equation that is scaled by a gradient of zero.
         cause = jnp.where(jnp.isnan(info.residual), 0, jnp.where(info.full_rank, 2, 1))
         cause = jnp.where(jnp.isinf(info.residual), 1, cause)
         messages = _MESSAGES
@@ -51,8 +51,7 @@ class Diagnosis(NamedTuple):
     def raise_unless(self, success: BoolScalar, value: Any, name: str) -> Any:
         """Attach the error that names the cause to `value`; `name` is that of the state.
 
-        Of a batch the largest number is reported, so that points without fault must have the
-        least.
+        For a batch the largest number is reported, so points without a fault must have the smallest.
         """
         messages = [message.format(y=name) for message in self.messages]
         cause = jnp.where(success, 0, self.cause)

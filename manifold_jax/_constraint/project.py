@@ -1,4 +1,4 @@
-"""Moving one point onto the manifold: any point, and initial values."""
+"""Projection of a single point: any point, and initial values."""
 
 import dataclasses
 from typing import TypeVar
@@ -18,7 +18,7 @@ from .projection_info import ProjectionInfo
 from .settings import NewtonProjection
 
 
-State = TypeVar("State")  # of the same structure goes in and comes out
+State = TypeVar("State")  # the result has the same structure as the argument
 
 
 @clear_errors
@@ -55,10 +55,9 @@ def project(
 
     **Raises:**
 
-    `TypeError` or `ValueError` for states or residuals of the wrong type or shape. With `throw=True`
-    a `RuntimeError` (under `jit` too, and for a batch if one of its points fails) that says whether
-    the constraint was not finite, its Jacobian rank deficient, or the equations could not be
-    satisfied.
+    `TypeError` or `ValueError` for states or residuals of the wrong type or shape. With `throw=True` a
+    `RuntimeError` (under `jit` too, and for a batch if one of its points fails) that says whether the
+    constraint was not finite, its Jacobian rank deficient, or the equations could not be satisfied.
 
     [`consistent_state`][] is the same for initial values.
     """
@@ -112,13 +111,13 @@ def moved(
     name: str,
     throw: bool,
 ) -> tuple[Y, ProjectionInfo]:
-    """One point that may be far from the manifold, `name` in messages."""
+    """Move one point that may be far from the manifold; `name` is its name in messages."""
     check_constraint_type(constraint)
     check_state(y, name)
     y = jtu.tree_map(jnp.asarray, y)
     check_constraint(constraint, t, y, args)
     p, info = constraint.correct(projection, t, y, args, far=True)
-    # Also what the constraint does not see.
+    # NaN in components that the constraint does not depend on is a failure, too.
     info = dataclasses.replace(info, success=info.success & is_finite(y))
     if throw:
         diagnosis = Diagnosis.of_start(constraint, t, y, args, info)

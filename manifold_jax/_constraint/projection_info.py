@@ -17,10 +17,10 @@ from .correction import CorrectionRoot
 
 
 class ProjectionInfo(eqx.Module):
-    """What a projection did.
+    """Report of a projection.
 
     - `multipliers`: `lambda` of shape `(m,)` in `W (p - y) + G(y)^T lambda = 0`.
-    - `iterations`: Newton iterations that were taken.
+    - `iterations`: the number of Newton iterations.
     - `residual`: the scaled residual at the returned point, `max_i |g_i| / scale_i`.
     - `correction`: the distance moved, `max_j |p_j - y_j| / (|y_j| + 1)`.
     - `full_rank`: whether the rows of the Jacobian at `y` were linearly independent.
@@ -35,7 +35,7 @@ class ProjectionInfo(eqx.Module):
     success: BoolScalar
 
     def __repr__(self) -> str:
-        """Show numbers where they are known, that is not while tracing."""
+        """Show numbers if they are known, that is, not while tracing."""
         values = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
         if not all(_is_known(value) for value in values.values()):
             return eqx.tree_pformat(self)
@@ -44,7 +44,7 @@ class ProjectionInfo(eqx.Module):
 
     @staticmethod
     def of_nothing(y: Y, success: BoolScalar) -> "ProjectionInfo":
-        """Describe a state that has been left as it was."""
+        """Report that a state was left as it was."""
         dtype = jnp.result_type(*jtu.tree_leaves(y))
         zero = jnp.zeros((), dtype)
         none = jnp.zeros((0,), dtype)
@@ -54,9 +54,8 @@ class ProjectionInfo(eqx.Module):
 
     @staticmethod
     def of_formula(y: Y, p: Y, residual: FloatScalar, success: BoolScalar) -> "ProjectionInfo":
-        """Describe the correction by a constraint that corrects itself by a formula: no iterations
-        and no multipliers.
-        `residual` is the scaled residual at the point `p` to which `y` was moved."""
+        """Report the correction by a formula, without iterations and multipliers. `residual` is the
+        scaled residual at the point `p` to which `y` was moved."""
 
         def distance(a: Array, b: Array) -> FloatScalar:
             return jnp.max(jnp.abs(b - a) / (jnp.abs(a) + 1), initial=0.0)
@@ -69,7 +68,7 @@ class ProjectionInfo(eqx.Module):
 
     @staticmethod
     def of_parts(*parts: "ProjectionInfo") -> "ProjectionInfo":
-        """Describe a state whose parts have been corrected one by one."""
+        """Combine the reports of parts of a state that were corrected separately."""
         joined = lambda combine, name: functools.reduce(combine, [getattr(p, name) for p in parts])
         return ProjectionInfo(
             multipliers=jnp.concatenate([part.multipliers for part in parts]),
@@ -82,7 +81,7 @@ class ProjectionInfo(eqx.Module):
 
     @staticmethod
     def of_correction(x: Float[Array, " n"], *roots: CorrectionRoot) -> "ProjectionInfo":
-        """Describe the correction of `x`, whose parts have been moved to those roots."""
+        """Report the correction of `x`, whose parts have been moved to these roots."""
         moved = jnp.concatenate([root.p for root in roots]) - x
         correction = jnp.max(jnp.abs(moved) / (jnp.abs(x) + 1))
         return ProjectionInfo(

@@ -15,7 +15,7 @@ from .._linalg.rows import AbstractRows, Rows
 def residual_vector(
     constraint: ResidualFunction, t: RealScalarLike, y: Y, args: Args
 ) -> Float[Array, " m"]:
-    """The residual as one vector, in the floating-point type of the state."""
+    """Return the residual as one vector, in the floating-point type of the state."""
     flat, _ = jfu.ravel_pytree(constraint(t, y, args))
     return flat
 
@@ -23,21 +23,19 @@ def residual_vector(
 def jacobian(
     residual: Callable[[Float[Array, " n"]], Float[Array, " m"]], x: Float[Array, " n"]
 ) -> tuple[Float[Array, " m"], Float[Array, "m n"]]:
-    """Residual and Jacobian at once: `m` pullbacks, the cheap direction as `m <= n`."""
+    """Return the residual and its Jacobian, by `m` pullbacks: the cheap direction, as `m <= n`."""
     r, pullback = jax.vjp(residual, x)
     (rows,) = jax.vmap(pullback)(jnp.eye(r.shape[0], dtype=r.dtype))
     return r, rows
 
 
 def row_scale(G: Rows, x: Float[Array, " n"]) -> Float[Array, " m"]:
-    """Typical size of each residual, `max_j |G_ij| (|x_j| + 1)`.
+    """Return the typical size of each residual, `max_j |G_ij| (|x_j| + 1)`.
 
-    This is row equilibration (Sudarsan & Keerthi 1998, eqs. (3.3)-(3.4), with the typical
-    sizes taken from the state).
-
-    The 1 stands for lengths that the state does not show. With the size of the state in its place
-    a third of the points beside a rod of length 1, given as displacements of 1e-3, could not be
-    corrected: the residual has rounding errors of 1e-16 whatever the displacements.
+    This is row equilibration (Sudarsan & Keerthi 1998, eqs. (3.3)-(3.4), with the typical sizes taken
+    from the state). The 1 stands for lengths that the state does not show. With the size of the state
+    in its place a third of the points beside a rod of length 1, given as displacements of 1e-3, could
+    not be corrected: the residual has rounding errors of 1e-16 whatever the displacements.
     """
     if isinstance(G, AbstractRows):
         scale = G.sizes(jnp.abs(x) + 1)
@@ -47,6 +45,6 @@ def row_scale(G: Rows, x: Float[Array, " n"]) -> Float[Array, " m"]:
 
 
 def as_time(t: RealScalarLike, dtype: Any) -> Array:
-    """A time as an array of floating point, also where it was given as a whole number."""
+    """Return a time as a floating-point array, also if it was given as an integer."""
     t = jnp.asarray(t)
     return t if jnp.issubdtype(t.dtype, jnp.floating) else t.astype(dtype)

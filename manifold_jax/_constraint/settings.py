@@ -1,4 +1,4 @@
-"""How corrections are made: in which norm, how many iterations, and how accurately."""
+"""Settings of corrections: the norm, the number of iterations and the tolerance."""
 
 from typing import Any, Literal
 
@@ -15,7 +15,7 @@ from .._base.types import RealScalarLike, Y
 
 
 class NewtonProjection(eqx.Module):
-    """How to correct a point `y`: to `p = y + V z`, `V = W^-1 G(y)^T`, by a simplified Newton
+    """Settings of the correction of a point `y` to `p = y + V z`, `V = W^-1 G(y)^T`, by a simplified Newton
     iteration on the `m` multipliers `z`.
 
     `V` is fixed at the point that is corrected, and `z` the root of the square system
@@ -35,20 +35,19 @@ class NewtonProjection(eqx.Module):
 
     **Arguments:**
 
-    - `metric`: the norm in which the correction is orthogonal. `None` is the identity, or
-        `"error"` with an `atol` below the rounding of a number of size one, which says that components far
-        smaller count, too; and the mass matrix for the constraint of a [`MechanicalSystem`][].
-        `"identity"` in any case; `"error"` for
-        the norm of the step size controller, `w_j = 1 / (atol + rtol |y_j|)^2`; or a pytree
-        like `y` of positive weights `w_j`, large for components that should stay put.
-    - `max_steps`: the most Newton iterations before the projection fails. 1 is a method of
+    - `metric`: the norm in which the correction is orthogonal. By default, `None`, the mass matrix for
+        the constraint of a [`MechanicalSystem`][]; otherwise the identity, or `"error"` if `atol` is
+        below the rounding of a number of size one, so that far smaller components count, too.
+        `"identity"` in any case; `"error"` for the norm of the step size controller, `w_j = 1 / (atol
+        + rtol |y_j|)^2`; or a pytree like `y` of positive weights `w_j`, large for components that
+        should hardly move.
+    - `max_steps`: the largest number of Newton iterations before the projection fails. 1 is a method of
         its own, post-stabilization: one Newton step per step of the solver, successful if it
         lowers the residual; states are then near the manifold (the square of the local error),
         not on it to round-off.
-    - `tolerance`: the largest scaled residual that counts as success. `None` is 50
-        rounding units of the state's type. Where a residual has larger rounding errors than
-        that (large terms that cancel) corrections fail: write it without cancellation, or
-        raise the tolerance.
+    - `tolerance`: the largest scaled residual that counts as success. `None` is 50 rounding units of
+        the state's type. Where a residual has larger rounding errors than that (large terms that
+        cancel) corrections fail: write it without cancellation, or raise the tolerance.
     - `rtol`, `atol`: the tolerances of the step size controller, for `metric="error"`;
         `mj.diffeqsolve` fills them in.
 
@@ -86,17 +85,17 @@ class NewtonProjection(eqx.Module):
             raise ValueError(f"`max_steps` must be a positive integer, got {self.max_steps!r}.")
 
     def tolerance_for(self, dtype: Any) -> RealScalarLike:
-        """The largest scaled residual that counts as success."""
+        """Return the largest scaled residual that counts as success."""
         return 50 * float(jnp.finfo(dtype).eps) if self.tolerance is None else self.tolerance
 
     @property
     def is_euclidean(self) -> bool:
-        """Whether nearest means nearest in the plain norm, for constraints without masses."""
+        """Whether the nearest point is that in the plain norm, for constraints without masses."""
         return self.metric is None or (isinstance(self.metric, str) and self.metric == "identity")
 
     def inverse_metric(self, y: Y) -> Float[Array, " n"] | None:
-        """Diagonal of `W^-1`, in the order of `ravel_pytree(y)`; `None` for the identity, and for
-        the masses of a mechanical system unless `metric="identity"`."""
+        """Return the diagonal of `W^-1`, in the order of `ravel_pytree(y)`; `None` for the identity,
+        and for the masses of a mechanical system unless `metric="identity"`."""
         if self.metric is None or isinstance(self.metric, str):
             return self._error_weights(y) if self.metric == "error" else None
         if jtu.tree_structure(self.metric) != jtu.tree_structure(y):
@@ -116,9 +115,10 @@ class NewtonProjection(eqx.Module):
         return 1 / jfu.ravel_pytree(jtu.tree_map(spread, self.metric, y))[0]
 
     def inverse_metric_without_masses(self, y: Y) -> Float[Array, " n"] | None:
-        """The same where `None` is not the masses. In the identity a correction of rounding size of a
-        large component moves a small one by as much: Robertson's reaction to 1e11 with `atol=1e-14` has
-        then 6.0 digits instead of 7.2, and makes 857 steps instead of 655."""
+        """Return the diagonal of `W^-1` for constraints without masses, where `None` is the identity.
+        In the identity a correction of rounding size of a large component moves a small one by as much:
+        Robertson's reaction to 1e11 with `atol=1e-14` then has 6.0 digits instead of 7.2, and takes 857
+        steps instead of 655."""
         atol = self.atol if isinstance(self.rtol, int | float) else None
         if (
             self.metric is None
@@ -137,7 +137,7 @@ class NewtonProjection(eqx.Module):
         return (self.atol + self.rtol * jnp.abs(jfu.ravel_pytree(y)[0])) ** 2
 
 
-# Units of rounding.
+# In units of rounding.
 _SMALLEST = 100
 
 
@@ -146,5 +146,5 @@ def _rounding(y: Y) -> float:
 
 
 def _may_be_positive(number: Any) -> bool:
-    """Unknown while tracing."""
+    """Whether weights are positive; true while tracing, when they are unknown."""
     return isinstance(number, jax.core.Tracer) or bool(np.all(np.asarray(number) > 0))

@@ -1,4 +1,4 @@
-"""How far states are from the manifold."""
+"""Distance of states from the manifold."""
 
 from typing import Any
 
@@ -23,7 +23,7 @@ from .settings import NewtonProjection
 def constraint_violation(
     constraint: AbstractConstraint, t: Any, y: Y, args: Args = None
 ) -> FloatScalar:
-    """How far from the manifold: `max_i |g_i| / scale_i`, `scale_i = max_j |G_ij| (|y_j| + 1)`.
+    """Distance from the manifold: `max_i |g_i| / scale_i`, `scale_i = max_j |G_ij| (|y_j| + 1)`.
 
     **Arguments:**
 
@@ -34,12 +34,12 @@ def constraint_violation(
 
     **Returns:**
 
-    One number, the largest over the residuals and over all finite times (the unused
-    end of a `SaveAt(steps=True)` buffer is skipped). Round-off is about `1e-16` in
-    double precision. For absolute residuals call the constraint itself.
+    One number, the largest over the residuals and over all finite times (the unused end of a
+    `SaveAt(steps=True)` buffer is skipped). Round-off is about `1e-16` in double precision. For
+    absolute residuals call the constraint itself.
 
-    Not relative to states smaller than 1: of a state of size `s` a point off by all of its size
-    has a violation of about `s`. Rescale those below 1e-6, see [`NewtonProjection`][].
+    The scale is not smaller for states smaller than 1: a point that is off by all of the size `s` of a
+    state has a violation of about `s`. Rescale states below 1e-6, see [`NewtonProjection`][].
     """
     check_constraint_type(constraint)
     check_state(y, "y")
@@ -63,4 +63,4 @@ def _violation(constraint: AbstractConstraint, t: Array, y: Y, args: Args) -> Fl
     equations = equations_of(
         constraint, t, y, args, NewtonProjection(), constraint.redundant, structure=structure
     )
-    return equations.level(equations.normals())
+    return equations.scaled_residual(equations.normals())

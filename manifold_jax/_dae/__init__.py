@@ -5,8 +5,8 @@ A pendulum, `F(t, x, x', args)` with the unknowns `x, y, u, v, lambda`, as an ex
     A: x' - u = 0                C: u' + lambda x = 0            E: x^2 + y^2 - 1 = 0
     B: y' - v = 0                D: v' + lambda y + g = 0
 
-- `equations.py`, `occurrence.py`: which derivative of which unknown is in which equation, found from
-  the function. The signature matrix has the highest ones (`-` where an unknown is absent):
+- `equations.py`, `occurrence.py`: which derivative of which unknown occurs in which equation, found
+  from the function. The signature matrix has the highest ones (`-` where an unknown is absent):
 
           x  y  u  v  lambda   c
       A   1  -  0  -    -      1
@@ -18,11 +18,11 @@ A pendulum, `F(t, x, x', args)` with the unknowns `x, y, u, v, lambda`, as an ex
 
 - `signature.py`: the smallest offsets with `d_j - c_i >= sigma_ij`: A and B are differentiated once, E
   twice, which leaves sum(d) - sum(c) = 2 degrees of freedom; the index is 3.
-- `aliases.py`, `combined.py`: unknowns that are others under another name, equations from which derivatives
-  cancel, so that the analysis is about what is left.
+- `aliases.py`, `combined.py`: unknowns that are derivatives of others under another name, and combinations
+  of equations whose derivatives cancel; both are eliminated before the analysis.
 - `layout.py`: which derivatives are states, and where each number is. `analysis.py` has all of this.
-- `compressed.py`, `samples.py`, `pivots.py`: the matrix of the leading derivatives, whether it is
-  regular, and what of it is eliminated beforehand.
+- `compressed.py`, `samples.py`, `block_elimination.py`: the matrix of the leading derivatives, whether it is
+  nonsingular, and the pivots that are eliminated beforehand.
 - `highest_derivatives.py`: the linear equations for `x'', y'', u', v', lambda`: the vector field.
 - `reduced.py`: the field of the state, and E with its first derivative and A, B where they are not
   eliminated: the manifold.

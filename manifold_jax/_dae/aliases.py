@@ -1,8 +1,8 @@
 """Unknowns that are derivatives of others by an equation like `x' - v = 0`.
 
-Such a `v` is the derivative `x'` under another name, and the equation is one that needs neither
-to be differentiated nor solved: `v'` is `x''`. In equations written for first derivatives these
-are half of all.
+Such a `v` is the derivative `x'` under another name, and the equation needs neither to be
+differentiated nor solved: `v'` is `x''`. Half of the equations of a first-order system are of this
+kind.
 """
 
 from typing import Any, NamedTuple
@@ -12,12 +12,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from .occurrence import Example, nonlinear_unknowns, Occurrence
-from .signature import Structure
+from .signature import DAEStructure
 
 
 class Aliases(NamedTuple):
-    """Unknown `k` is `factor[k]` times derivative `shift[k]` of unknown `root[k]`; `equations` are
-    those that say nothing else."""
+    """Unknown `k` is `factor[k]` times derivative `shift[k]` of unknown `root[k]`. `equations` are
+    those that only define an alias."""
 
     root: np.ndarray
     shift: np.ndarray
@@ -31,7 +31,7 @@ class Aliases(NamedTuple):
 
     @property
     def columns(self) -> np.ndarray:
-        """For each unknown the place of its root among those that are left."""
+        """The place of the root of each unknown among those that are left."""
         return np.searchsorted(self.roots, self.root)
 
     @property
@@ -46,9 +46,9 @@ class Aliases(NamedTuple):
         used = []
         for row, (unknown, order), target, ratio in _candidates(example, occurrence):
             new = root[unknown] != target and root[target] == target
-            if not new:  # a second equation for it, or a chain that is closed
+            if not new:  # a second equation for it, or a closed chain
                 continue
-            follows = root == target  # the target itself, and what is known as its derivative
+            follows = root == target  # the target itself, and aliases of its derivatives
             shift[follows] += order + shift[unknown]
             factor[follows] *= ratio * factor[unknown]
             root[follows] = root[unknown]
@@ -56,8 +56,7 @@ class Aliases(NamedTuple):
         return Aliases(root, shift, factor, np.array(used, int))
 
     def merged(self, there: np.ndarray) -> np.ndarray:
-        """Return, of an array `(equations, derivatives, unknowns)` of bools: that of the equations
-        and unknowns that are left."""
+        """Reduce a Boolean array `(equations, derivatives, unknowns)` to what is left of both."""
         n, levels = there.shape[1:][::-1]
         out = np.zeros((n, levels + int(self.shift.max(initial=0)), n), bool)
         for k in range(n):
@@ -66,7 +65,7 @@ class Aliases(NamedTuple):
 
 
 def _candidates(example: Example, occurrence: Occurrence) -> list[Any]:
-    """Equations `a x^(s) + b v = 0` with constants `a`, `b`: `(row, (x, s), v, -a / b)`."""
+    """Return the equations `a x^(s) + b v = 0` with constants `a`, `b`: `(row, (x, s), v, -a / b)`."""
     there = occurrence.there
     constant = ~(
         occurrence.depends_on_time | occurrence.depends_on_args | occurrence.coefficients_vary
@@ -77,7 +76,7 @@ def _candidates(example: Example, occurrence: Occurrence) -> list[Any]:
 
     @jax.jit
     def sums(t: Any, args: Any) -> Any:
-        """Of the values at zero, of the coefficients of derivatives, and of those of unknowns."""
+        """Return sums of the values at zero, of coefficients of derivatives, and of those of unknowns."""
         at = lambda *jets: example.residual(t, jets, args)
         zero, *higher = zeros = [jnp.zeros_like(x) for x in example.jets]
         values, a = jax.jvp(at, zeros, [zero, *map(jnp.ones_like, higher)])
@@ -94,22 +93,21 @@ def _candidates(example: Example, occurrence: Occurrence) -> list[Any]:
     return found
 
 
-def lifted(example: Example, aliases: Aliases, structure: Structure) -> Structure:
-    """The structure with the fewest differentiations in which the equations with `c_i = 0`, too,
+def lifted(example: Example, aliases: Aliases, structure: DAEStructure) -> DAEStructure:
+    """Return the structure with the fewest differentiations in which the equations with `c_i = 0`, too,
     are linear in the leading derivatives."""
     belongs_to = np.argsort(structure.transversal)
     while (found := _nonlinear(example, aliases, structure)).any():
         at_least = structure.c.copy()
         at_least[belongs_to[found]] += 1
-        raised = Structure.of(structure.sigma, at_least)
+        raised = DAEStructure.of(structure.sigma, at_least)
         assert raised is not None
         structure = raised
     return structure
 
 
-def _nonlinear(example: Example, aliases: Aliases, structure: Structure) -> np.ndarray:
-    """Return which of the leading derivatives occur nonlinearly in equations that are not
-    differentiated."""
+def _nonlinear(example: Example, aliases: Aliases, structure: DAEStructure) -> np.ndarray:
+    """Return which leading derivatives occur nonlinearly in equations that are not differentiated."""
     levels = structure.d[aliases.columns] - aliases.shift
     (unknowns,) = np.nonzero((levels >= 0) & (levels <= example.equations.order))
     depends = nonlinear_unknowns(example, levels[unknowns], unknowns)

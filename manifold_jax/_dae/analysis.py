@@ -1,4 +1,4 @@
-"""All that is known of a system before it is evaluated."""
+"""The structural analysis of a system, before it is evaluated."""
 
 import dataclasses
 import functools
@@ -10,19 +10,19 @@ from jaxtyping import Array, Float
 
 from .._base.types import Args
 from .aliases import Aliases, lifted
+from .block_elimination import Elimination
 from .compressed import Compressed
 from .derivatives import pick, total_derivatives
-from .equations import Equations
-from .layout import Layout
+from .equations import ResidualEquations
+from .layout import StateLayout
 from .occurrence import Example, Occurrence
-from .pivots import Elimination
 from .samples import Samples
-from .signature import signature, Structure
+from .signature import DAEStructure, signature
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Analysis:
-    """What follows from the occurrence of the unknowns. Compared by identity.
+    """Structure, aliases, layout and elimination of a system. Compared by identity.
 
     - `written`: the structure of all equations.
     - `unlifted`: that of the equations that are left, with the fewest differentiations.
@@ -31,30 +31,30 @@ class Analysis:
 
     example: Example
     occurrence: Occurrence
-    written: Structure
-    unlifted: Structure
-    layout: Layout
+    written: DAEStructure
+    unlifted: DAEStructure
+    layout: StateLayout
     entries: Compressed
     implicit: bool
 
     @staticmethod
     def of(example: Example, occurrence: Occurrence, implicit: bool) -> "Analysis | None":
-        """`None` if the structure is singular."""
-        written = Structure.of(signature(occurrence.there))
+        """Analyse equations; return `None` if the structure is singular."""
+        written = DAEStructure.of(signature(occurrence.there))
         if written is None:
             return None
         aliases, order = Aliases.of(example, occurrence), example.equations.order
         there = aliases.merged(occurrence.there)
-        unlifted = Structure.of(signature(there))
+        unlifted = DAEStructure.of(signature(there))
         assert unlifted is not None
         structure = unlifted if implicit else lifted(example, aliases, unlifted)
-        layout = Layout.of(structure, aliases, order)
+        layout = StateLayout.of(structure, aliases, order)
         entries = Compressed.of(structure, aliases, there, order + 1)
         return Analysis(example, occurrence, written, unlifted, layout, entries, implicit)
 
     @property
     def c(self) -> np.ndarray:
-        """How often each of the equations that are left is differentiated."""
+        """The number of differentiations of each of the equations that are left."""
         return self.layout.structure.c
 
     @property
@@ -85,17 +85,17 @@ class Analysis:
     def jets(
         self, z: Float[Array, " a"], w: Float[Array, " b"] | None, differentiations: int
     ) -> tuple[Float[Array, " n"], ...]:
-        """The derivatives of all unknowns that equations contain when they are differentiated so often,
-        as far as they are known; else zero."""
+        """Return the derivatives of all unknowns that occur in the equations differentiated up to this
+        order; zero for those that are unknown."""
         number = self.example.equations.order + 1 + differentiations
         return tuple(self.layout.jet(k)(z, w) for k in range(number))
 
     def jets_of_states(
         self, z: Float[Array, " a"], w: Float[Array, " b"] | None, differentiations: int
     ) -> tuple[Array, ...]:
-        """Return the derivatives for equations of states alone. The others, evaluated with them,
-        have to stay finite, and of moderate size where they cancel: for unknowns that are not states
-        those in `w` are taken, without derivatives, or the example."""
+        """Return the derivatives for equations of states alone. The others, evaluated with them, have
+        to stay finite, and of moderate size where they cancel: for unknowns that are not states use
+        those in `w`, without derivatives, or the example."""
         x, *others = self.jets(z, None, differentiations)
         known = self.layout.jet(0).index
         known = (known >= 0) & (known < self.layout.num_states)
@@ -106,14 +106,14 @@ class Analysis:
 
     def differentiated(
         self,
-        equations: Equations,
+        equations: ResidualEquations,
         t: Array,
         jets: tuple[Array, ...],
         args: Args,
         first: np.ndarray | int,
         end: np.ndarray,
     ) -> Float[Array, " m"]:
-        """`F_i^(k)` for `first_i <= k < end_i`, lower derivatives first."""
+        """Return `F_i^(k)` for `first_i <= k < end_i`, lower derivatives first."""
         number = int(end.max(initial=1))
         levels = total_derivatives(equations, t, jets, args, number - 1)
         parts = [pick(levels[k], self.rows[(first <= k) & (k < end)]) for k in range(number)]

@@ -2,10 +2,10 @@
 
     C (u' - v') = i(u),   C (v' - u') = j(v)
 
-are regular to the structure, but not solvable for `u'` and `v'`: their sum `0 = i(u) + j(v)` is an
-equation of the unknowns alone. Found where weights are constant and coefficients are, too, or are
-added and subtracted as one number (like the charge between two nodes of a circuit), and put in the
-place of one of the equations.
+are structurally nonsingular, but cannot be solved for `u'` and `v'`: their sum `0 = i(u) + j(v)`
+contains no derivative. Such combinations are found if the weights are constant, and if the coefficients
+are constant, too, or are added and subtracted as one number (like the charge between two nodes of a
+circuit). The combination replaces one of the equations.
 """
 
 import functools
@@ -18,18 +18,18 @@ from jaxtyping import Array
 
 from .._jaxpr.incidence import incidence
 from .analysis import Analysis
-from .equations import Combination
+from .equations import EquationCombination
 from .occurrence import Example, Occurrence, tracked
 from .samples import singular_below
 
 
-# Of a sum that should be zero, relative to its parts.
+# A sum counts as zero below this fraction of its terms.
 _ROUNDING = 1e-12
 _POINTS = 3
 
 
 def without_cancellations(found: Analysis) -> Analysis:
-    """Add combinations of equations from which derivatives are gone, as long as there are some."""
+    """Replace equations by combinations without their highest derivatives, as long as there are any."""
     while found.samples.singular and (repairs := cancelled(found)):
         equations = found.example.equations
         for repair in repairs:
@@ -45,17 +45,15 @@ def without_cancellations(found: Analysis) -> Analysis:
 
 
 class Cancelled(NamedTuple):
-    """A combination in the place of one of the equations, and what is not in it any more,
-    `gone[k, j]`."""
+    """A combination that replaces an equation, and the derivatives it has lost, `gone[k, j]`."""
 
-    combination: Combination
+    combination: EquationCombination
     gone: np.ndarray
 
 
 def cancelled(analysis: Analysis) -> list[Cancelled]:
-    """Return the cancellations among equations that are differentiated equally often: those that
-    hold for other parameters and times, too, and of which none changes an equation that another one
-    needs."""
+    """Return the cancellations among equations that are differentiated equally often: those that hold
+    for other parameters and times, too, and of which none changes an equation that another one needs."""
     example, occurrence, layout = analysis.example, analysis.occurrence, analysis.layout
     jacobians = _jacobians(example, occurrence.there)
     found: list[Cancelled] = []
@@ -76,13 +74,13 @@ def cancelled(analysis: Analysis) -> list[Cancelled]:
             continue
         target = int(rows[np.argmax(np.abs(weights))])
         parts = tuple(zip(rows.tolist(), weights.tolist(), strict=True))
-        found.append(Cancelled(Combination(target, parts), gone))
+        found.append(Cancelled(EquationCombination(target, parts), gone))
     return found
 
 
 def _constant(example: Example, rows: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Which coefficients of the weighted sum do not depend on anything, shape `(levels, n)`. Read
-    off its gradient, where what is added and subtracted meets before it is multiplied."""
+    """Return which coefficients of the weighted sum are constant, shape `(levels, n)`. Found from its
+    gradient, in which numbers are added and subtracted before they are multiplied."""
     shape = len(example.jets), example.equations.n
     cotangent = np.zeros(example.equations.n)
     cotangent[rows] = weights
@@ -95,12 +93,12 @@ def _constant(example: Example, rows: np.ndarray, weights: np.ndarray) -> np.nda
     inputs = [tracked(tree, anything) for tree in (example.t, example.jets, example.args)]
     try:
         return ~incidence(gradient, *inputs).depends[:, 0].reshape(shape)
-    except (ValueError, NotImplementedError):  # no gradient, as of `while_loop`
+    except (ValueError, NotImplementedError):  # e.g. `while_loop` has no gradient
         return np.zeros(shape, bool)
 
 
 def _vanishes(jacobians: list[np.ndarray], rows: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Where the weighted sum of coefficients is zero at all points, shape `(levels, n)`."""
+    """Return which coefficients of the weighted sum are zero at all points, shape `(levels, n)`."""
     vanishes = np.ones(jacobians[0].shape[1:], bool)
     for J in jacobians:
         parts = weights[:, None, None] * J[rows]
@@ -109,9 +107,9 @@ def _vanishes(jacobians: list[np.ndarray], rows: np.ndarray, weights: np.ndarray
 
 
 def _common_null_vectors(matrices: list[np.ndarray]) -> list[np.ndarray]:
-    """Return the common null vectors with few numbers that are not zero, the first positive, the
-    largest of them 1. Columns of each matrix are scaled for themselves: exponential functions differ
-    by many decades from sample to sample."""
+    """Return the common null vectors with few nonzero entries, the first positive, the largest of them
+    1. The columns of each matrix are scaled separately: exponential functions differ by many decades
+    from sample to sample."""
     every = np.concatenate(matrices, axis=1)
     scale = np.ones(len(every))
     for _ in range(3):
@@ -123,7 +121,7 @@ def _common_null_vectors(matrices: list[np.ndarray]) -> list[np.ndarray]:
     left, values, _ = np.linalg.svd(every)
     null = left[:, values <= singular_below(every.dtype) * values[0]].T
     found = []
-    for k in range(len(null)):  # reduced to echelon form
+    for k in range(len(null)):  # reduce to echelon form
         column = int(np.argmax(np.abs(null[k])))
         null[k] = null[k] / null[k, column]
         others = np.arange(len(null)) != k
@@ -137,8 +135,7 @@ def _common_null_vectors(matrices: list[np.ndarray]) -> list[np.ndarray]:
 
 
 def _jacobians(example: Example, there: np.ndarray) -> list[np.ndarray]:
-    """Return the Jacobians with respect to all derivatives, `(n, levels, n)`, at other times,
-    values and parameters."""
+    """Return all Jacobians `(n, levels, n)` at other times, values and parameters."""
 
     @jax.jit
     def jacobian(t: Array, jets: tuple[Array, ...], args: object) -> Array:
@@ -150,7 +147,7 @@ def _jacobians(example: Example, there: np.ndarray) -> list[np.ndarray]:
     def moved(x: Array, k: int) -> Array:
         if not jnp.issubdtype(x.dtype, jnp.floating):
             return x
-        # Zeros, too: a parameter may be zero in the example only.
+        # Zeros are changed, too: a parameter may be zero in the example only.
         size = jnp.where(x == 0, 1, x)
         return x + size * jnp.asarray(0.1 * k * random.normal(size=x.shape), x.dtype)
 

@@ -11,19 +11,21 @@ from .._base.types import Args
 from .._linalg.coloring import greedy_colors
 from .aliases import Aliases
 from .derivatives import pick
-from .signature import Structure
+from .signature import DAEStructure
 
 
 class Compressed(NamedTuple):
     """The matrix `J_ij = dF_i^(c_i) / dx_j^(d_j) = dF_i / dx_j^(d_j - c_i)` of the equations and
-    unknowns that are left: its entries are entries of derivatives along the `seeds`."""
+    unknowns that are left; its entries are those of derivatives along the `seeds`."""
 
     seeds: np.ndarray  # (colors, levels, n)
     places: np.ndarray  # (rows, columns) in the flat derivatives, -1 for zero
 
     @staticmethod
-    def of(structure: Structure, aliases: Aliases, there: np.ndarray, levels: int) -> "Compressed":
-        """`there` is the occurrence of the equations and unknowns that are left."""
+    def of(
+        structure: DAEStructure, aliases: Aliases, there: np.ndarray, levels: int
+    ) -> "Compressed":
+        """Color the columns; `there` is the occurrence of the equations and unknowns that are left."""
         rows, columns = np.nonzero(structure.leading)
         orders = structure.sigma[rows, columns]
         pairs, which = np.unique(np.stack([orders, columns], 1), axis=0, return_inverse=True)
@@ -43,7 +45,7 @@ class Compressed(NamedTuple):
         return Compressed(seeds, places)
 
     def derivatives(self, function: Any, t: Array, jets: tuple[Array, ...], args: Args) -> Array:
-        """Flat, in which the entries are found."""
+        """Return the flat array of directional derivatives, of which the entries are taken."""
         seeds = tuple(jnp.asarray(self.seeds[:, k], jets[0].dtype) for k in range(len(jets)))
         at = lambda jets: function(t, jets, args)
         along = lambda *rates: jax.jvp(at, (jets,), (rates,))[1]

@@ -1,4 +1,4 @@
-"""Vectors of derivatives, and how numbers are picked out of vectors."""
+"""Total derivatives of a function, and gathers from vectors."""
 
 import itertools
 from typing import Any
@@ -11,13 +11,13 @@ from jaxtyping import Array, Float
 from .._base.types import Args
 
 
-# Stretches of neighbours up to which they are cut out; more of them are picked one by one.
+# Largest number of runs of consecutive indices for which slices are taken; more are gathered.
 _MOST_STRETCHES = 16
 
 
 def pick(source: Float[Array, " a"], index: np.ndarray) -> Float[Array, " n"]:
-    """`source[index]`, zero where the index is negative. Cut out in stretches, through which the
-    compiler sees, and whose derivative is none of the slow scatters."""
+    """Return `source[index]`, zero where the index is negative. Runs of consecutive indices are sliced:
+    the compiler can see through slices, and their derivative is not a slow scatter."""
     if len(index) == 0:
         return jnp.zeros((0,), source.dtype)
     steps = np.diff(index)
@@ -35,11 +35,11 @@ def pick(source: Float[Array, " a"], index: np.ndarray) -> Float[Array, " n"]:
 def total_derivatives(
     function: Any, t: Array, jets: tuple[Array, ...], args: Args, order: int
 ) -> list[Float[Array, " n"]]:
-    """`F, dF/dt, ..., d^order F/dt^order` of `F(t, (x, x', ...), args)` where the derivatives of
-    `x` are `jets`, as many of them as that takes.
+    """Return `F, dF/dt, ..., d^order F/dt^order` of `F(t, (x, x', ...), args)`, given the derivatives
+    of `x`, `jets`, as many as that takes.
 
-    By nested forward mode: one level more costs two to three times as much to trace, which for the
-    few levels met here is less than Taylor mode takes, and works for every primitive.
+    By nested forward mode: one level more costs two to three times as much to trace, which for the few
+    levels met here is less than Taylor mode takes, and works for every primitive.
     """
 
     def level(order: int, t: Array, jets: tuple[Array, ...]) -> list[Array]:

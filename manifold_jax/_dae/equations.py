@@ -21,8 +21,7 @@ from .._constraint.checks import check_state
 
 
 def number_names(tree: Any, alone: str) -> list[str]:
-    """One for each number, in the order of `ravel_pytree`; `alone` is that of a tree that is just
-    one array."""
+    """Return a name for each number in the order of `ravel_pytree`; `alone` names a single array."""
     return [name for leaf in leaf_names(tree, alone) for name in leaf[1]]
 
 
@@ -39,26 +38,26 @@ def leaf_names(tree: Any, alone: str) -> list[tuple[str, list[str]]]:
 
 
 def listed(names: list[str], most: int = 8) -> str:
-    """List names in a message."""
+    """Join names for a message."""
     text = ", ".join(f"`{name}`" for name in names[:most])
     return text if len(names) <= most else f"{text} and {len(names) - most} more"
 
 
-class Combination(NamedTuple):
-    """Equation `row` replaced by the sum of `weight * equation` over `parts`."""
+class EquationCombination(NamedTuple):
+    """Replaces equation `row` by the sum of `weight * equation` over `parts`."""
 
     row: int
     parts: tuple[tuple[int, float], ...]
 
 
-class Equations(eqx.Module):
+class ResidualEquations(eqx.Module):
     """`n` equations in `n` unknowns and their derivatives up to `order`."""
 
     function: Callable
     order: int = eqx.field(static=True)
-    shapes: Any = eqx.field(static=True)  # of `x`, a pytree of jax.ShapeDtypeStruct, hashable
+    shapes: Any = eqx.field(static=True)  # of `x`, a hashable pytree of jax.ShapeDtypeStruct
     names: "Names" = eqx.field(static=True)
-    combinations: tuple[Combination, ...] = eqx.field(static=True, default=())
+    combinations: tuple[EquationCombination, ...] = eqx.field(static=True, default=())
 
     @property
     def n(self) -> int:
@@ -82,13 +81,13 @@ class Equations(eqx.Module):
             values = jnp.concatenate([values[:row], total, values[row + 1 :]])
         return values
 
-    def combined(self, combination: Combination) -> "Equations":
+    def combined(self, combination: EquationCombination) -> "ResidualEquations":
         every = (*self.combinations, combination)
         names = self.names.combined(combination)
         return dataclasses.replace(self, names=names, combinations=every)
 
     @staticmethod
-    def of(function: Callable, x: Any, args: Args, order: int) -> "Equations":
+    def of(function: Callable, x: Any, args: Args, order: int) -> "ResidualEquations":
         _check_order(order)
         _check_function(function, order)
         check_state(x, "x_example")
@@ -99,7 +98,7 @@ class Equations(eqx.Module):
         residual = eqx.filter_eval_shape(function, t, *[x] * (order + 1), args)
         _check_residual(residual, x)
         names = Names(tuple(number_names(residual, "F")), tuple(number_names(x, "x")))
-        return Equations(function, order, shapes, names)
+        return ResidualEquations(function, order, shapes, names)
 
 
 class Names(NamedTuple):
@@ -111,7 +110,7 @@ class Names(NamedTuple):
     def derivative(self, unknown: int, order: int) -> str:
         return self.unknowns[unknown] + "'" * order
 
-    def combined(self, combination: Combination) -> "Names":
+    def combined(self, combination: EquationCombination) -> "Names":
         text = ""
         for i, weight in combination.parts:
             size = "" if abs(weight) == 1 else f"{abs(weight):.3g} "

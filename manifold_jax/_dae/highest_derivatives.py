@@ -8,16 +8,16 @@ from jaxtyping import Array, Float
 from .._base.types import Args
 from .._linalg.newton import AbstractEquations, implicit_root, without_derivative
 from .analysis import Analysis
+from .block_elimination import Eliminated
 from .derivatives import pick
-from .equations import Equations
-from .pivots import Eliminated
+from .equations import ResidualEquations
 
 
 class HighestDerivatives(AbstractEquations):
-    """`F_i^(c_i) = 0` for the leading derivatives `w_j = x_j^(d_j)`, linear in them unless the form
-    is implicit, at one state."""
+    """The leading equations `F_i^(c_i) = 0` at one state, for the leading derivatives
+    `w_j = x_j^(d_j)`; linear in them unless the form is implicit."""
 
-    equations: Equations
+    equations: ResidualEquations
     t: Array
     z: Float[Array, " a"]
     args: Args
@@ -27,7 +27,7 @@ class HighestDerivatives(AbstractEquations):
         return z
 
     def residual(self, x: Float[Array, " n"] | None) -> Float[Array, " n"]:
-        """`None` for zeros."""
+        """Return the residual; `None` stands for zeros."""
         c = self.analysis.c
         jets = self.analysis.jets(self.z, x, int(c.max(initial=0)))
         values = self.analysis.differentiated(self.equations, self.t, jets, self.args, c, c + 1)
@@ -41,16 +41,16 @@ class HighestDerivatives(AbstractEquations):
         return self.analysis.entries.matrix(self._derivatives(w))
 
     def _derivatives(self, w: Float[Array, " n"] | None) -> Array:
-        """The same for all `w` unless the form is implicit."""
+        """Return the derivatives of the residual: the same for all `w` unless the form is implicit."""
         jets = self.analysis.jets(self.z, w if self.analysis.implicit else None, 0)
         return self.analysis.entries.derivatives(self.equations, self.t, jets, self.args)
 
     def solve(self) -> Float[Array, " n"]:
-        """NaN where the equations do not determine all of them. The derivative is that of the
-        solution: only the residual is differentiated, not the matrix."""
+        """Return the leading derivatives, NaN where the equations do not determine all of them. Only
+        the residual is differentiated, not the matrix: the derivative is that of the solution."""
         fixed = without_derivative(self)
         matrix = fixed.linearize(self.z)
         w = -matrix.solve(fixed.residual(None))
-        w = implicit_root(self, jnp.where(matrix.full_rank, w, 0))
+        w = implicit_root(self, jnp.where(matrix.usable, w, 0))
         # Added, not selected: the derivative of a discarded NaN would be NaN.
-        return w + jnp.where(matrix.full_rank, 0, jnp.nan).astype(w.dtype)
+        return w + jnp.where(matrix.usable, 0, jnp.nan).astype(w.dtype)

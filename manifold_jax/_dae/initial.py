@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 
 from .._base.errors import clear_errors
 from .._base.numbers import numbers_as_arrays
-from .._base.types import Args, BoolScalar, RealScalarLike, Y
+from .._base.types import Args, BoolScalar, FloatScalar, RealScalarLike, Y
 from .._constraint.projection_info import ProjectionInfo
 from .._constraint.residual import as_time, jacobian, row_scale
 from .._constraint.settings import NewtonProjection
@@ -22,7 +22,7 @@ from .._linalg.newton import find_root, implicit_root, SquareSystem, without_der
 from .._linalg.pivoted import factorize_equilibrated
 from .equations import leaf_names, listed
 from .highest_derivatives import HighestDerivatives
-from .layout import Gather, Layout
+from .layout import Gather, StateLayout
 from .nearest import Constrained, nearest_state, with_lifted
 from .reduced import Reduced
 from .samples import condition, dependent_rows, singular_below
@@ -32,12 +32,12 @@ _MOST_STEPS = 100
 
 
 class Guess(NamedTuple):
-    """A state, and which of its numbers may not move."""
+    """A guess of a state, part of which may be fixed."""
 
     z: Float[Array, " states"]
-    w: Float[Array, " n"]  # leading derivatives
-    fixed: tuple[bool, ...]
-    names: tuple[str, ...]  # of what is fixed, as given
+    w: Float[Array, " n"]  # the leading derivatives
+    fixed: tuple[bool, ...]  # for each number of `z`
+    names: tuple[str, ...]  # of the unknowns that are fixed, as given
 
     @staticmethod
     def of(system: Reduced, x: Y, derivatives: Any, fixed: Any) -> "Guess":
@@ -51,9 +51,9 @@ class Guess(NamedTuple):
         return Guess(z, w, _fixed(system, x, fixed), tuple(fixed))
 
 
-def _places_in_guess(layout: Layout, names: np.ndarray, number: int) -> Gather:
-    """Where each of these numbers is in the guesses of `x, x', ...`, as many as are given: under its
-    own name, or as a derivative of another unknown."""
+def _places_in_guess(layout: StateLayout, names: np.ndarray, number: int) -> Gather:
+    """Return where each of these numbers is in the `number` guesses of `x, x', ...`: under its own
+    name, or as a derivative of another unknown of which it is an alias."""
     aliases, n = layout.aliases, len(layout.aliases.root)
     index, scale = [], []
     for k, unknown in names.tolist():
@@ -108,9 +108,10 @@ def consistent_state(
     system: Reduced, t0: RealScalarLike, guess: Guess, args: Args, throw: bool
 ) -> tuple[Array, ProjectionInfo]:
     t = as_time(t0, guess.z.dtype)
-    z, info, regular = _found(system, t, guess, args)
+    z, info, nonsingular = _find_consistent_state(system, t, guess, args)
     if throw:
-        _explain(system.closing(t, system.split(z)[0], args), guess, info, regular)
+        leading = system.leading_equations(t, system.split(z)[0], args)
+        _explain(leading, guess, info, nonsingular)
         near = info.residual <= NewtonProjection().tolerance_for(z.dtype)
         cause = jnp.where(info.full_rank, jnp.where(near, 2, 1), 0)
         cause = jnp.where(info.success, 0, cause)
@@ -126,10 +127,11 @@ def _raise_unless(success: BoolScalar, z: Array, cause: Array, messages: tuple[s
 
 @numbers_as_arrays("args")
 @eqx.filter_jit
-def _found(
+def _find_consistent_state(
     system: Reduced, t: Array, given: Guess, args: Args
 ) -> tuple[Array, ProjectionInfo, BoolScalar]:
-    """The state, what was done, and whether the derivatives are determined there."""
+    """Return the state nearest to the guess, with the leading derivatives in the implicit form, what
+    was done, and whether the matrix of the leading derivatives is nonsingular there."""
     w, finite, implicit = given.w, jnp.all(jnp.isfinite(given.z)), system.analysis.implicit
     guess = jnp.where(finite, given.z, 0)
     free = jnp.asarray(np.where(given.fixed, 0, 1), guess.dtype)
@@ -137,36 +139,46 @@ def _found(
     z = with_lifted(system, t, nearest.z, args)
     solvable = jnp.asarray(True)
     if implicit:
-        w, solvable = _leading(system.closing(t, z, args), w)
-    closing, fixed_w = without_derivative((system.closing(t, z, args), w))
-    regular = closing.linearize(fixed_w).full_rank
-    t, args, c = closing.t, closing.args, system.analysis.c
-    residual = lambda z: system.hidden_constraints(t, z, args, 0, c, fixed_w)
-    r, G = jacobian(residual, closing.z)
-    level, full_rank = jnp.zeros((), guess.dtype), jnp.asarray(True)
-    if r.size > 0:  # or there may be no state at all
-        level = jnp.max(jnp.abs(r) / row_scale(G, closing.z))
-        full_rank = factorize_equilibrated(gram(G, G * free[None, :])).full_rank
-    near = level <= NewtonProjection().tolerance_for(z.dtype)
-    success = finite & near & nearest.settled & full_rank & regular & solvable
-    correction = jnp.max(jnp.abs(closing.z - guess) / (jnp.abs(guess) + 1), initial=0)
+        w, solvable = _solve_leading_equations(system.leading_equations(t, z, args), w)
+    leading, fixed_w = without_derivative((system.leading_equations(t, z, args), w))
+    nonsingular = leading.linearize(fixed_w).usable
+    scaled_residual, full_rank = _check_constraints(system, leading, fixed_w, free)
+    near = scaled_residual <= NewtonProjection().tolerance_for(z.dtype)
+    success = finite & near & nearest.settled & full_rank & nonsingular & solvable
+    correction = jnp.max(jnp.abs(leading.z - guess) / (jnp.abs(guess) + 1), initial=0)
     info = ProjectionInfo(
         multipliers=nearest.multipliers,
         iterations=nearest.iterations,
-        residual=jnp.where(finite, level, jnp.nan),
+        residual=jnp.where(finite, scaled_residual, jnp.nan),
         correction=jax.lax.stop_gradient(correction),
         full_rank=full_rank,
         success=success,
     )
     z = jnp.where(finite, z, given.z)
-    return jnp.concatenate([z, w]) if implicit else z, info, regular
+    return jnp.concatenate([z, w]) if implicit else z, info, nonsingular
 
 
-def _leading(
-    closing: HighestDerivatives, guess: Float[Array, " k"]
+def _check_constraints(
+    system: Reduced,
+    leading: HighestDerivatives,
+    w: Float[Array, " n"],
+    free: Float[Array, " states"],
+) -> tuple[FloatScalar, BoolScalar]:
+    """Return the largest scaled residual of the hidden constraints at a state, and whether their
+    gradients with respect to free components are independent."""
+    t, z, args, c = leading.t, leading.z, leading.args, system.analysis.c
+    r, G = jacobian(lambda z: system.hidden_constraints(t, z, args, 0, c, w), z)
+    if r.size == 0:  # there may be no state at all
+        return jnp.zeros((), free.dtype), jnp.asarray(True)
+    full_rank = factorize_equilibrated(gram(G, G * free[None, :])).usable
+    return jnp.max(jnp.abs(r) / row_scale(G, z)), full_rank
+
+
+def _solve_leading_equations(
+    leading: HighestDerivatives, guess: Float[Array, " k"]
 ) -> tuple[Float[Array, " k"], BoolScalar]:
-    """The derivatives near a guess, and whether they solve the equations."""
-    equations = SquareSystem(closing.residual, closing.matrix)
+    """Return the leading derivatives near a guess, and whether they solve the equations."""
+    equations = SquareSystem(leading.residual, leading.matrix)
     fixed, tolerance = without_derivative(equations), NewtonProjection().tolerance_for(guess.dtype)
     found = find_root(equations, guess, _MOST_STEPS, tolerance)
     change = fixed.linearize(found).solve(fixed.residual(found))
@@ -188,22 +200,22 @@ def _messages(guess: Guess) -> list[str]:
 
 
 def _explain(
-    closing: HighestDerivatives, guess: Guess, info: ProjectionInfo, regular: BoolScalar
+    leading: HighestDerivatives, guess: Guess, info: ProjectionInfo, nonsingular: BoolScalar
 ) -> None:
-    """Where numbers are known, say which equations are singular."""
-    if any(isinstance(x, jax.core.Tracer) for x in jtu.tree_leaves((closing, info))):
+    """Raise with the names of the equations that are singular, if numbers are known."""
+    if any(isinstance(x, jax.core.Tracer) for x in jtu.tree_leaves((leading, info))):
         return
-    if bool(info.success) or (any(guess.fixed) and bool(regular)):
+    if bool(info.success) or (any(guess.fixed) and bool(nonsingular)):
         return
-    matrix = np.asarray(closing.matrix())
+    matrix = np.asarray(leading.matrix())
     if not np.isfinite(matrix).all():
         raise ValueError(
             "`F` or its derivatives are not finite at the start. Give an `x_guess` where they are."
         )
     if condition(matrix) > 10 * singular_below(matrix.dtype):
         return
-    names = closing.equations.names.equations
-    rows = closing.analysis.rows[dependent_rows(matrix)]
+    names = leading.equations.names.equations
+    rows = leading.analysis.rows[dependent_rows(matrix)]
     raise ValueError(
         f"The equations {listed([names[i] for i in rows])} of `F`, differentiated as often as necessary, depend on each "
         "other at the start: they are redundant (remove one of them), or this is a singular configuration (start "

@@ -1,4 +1,4 @@
-"""Where each number stands: derivatives of unknowns in the state, equations in the constraint."""
+"""The places of numbers: derivatives of unknowns in the state, equations in the constraint."""
 
 from typing import NamedTuple
 
@@ -8,17 +8,17 @@ from jaxtyping import Array, Float
 
 from .aliases import Aliases
 from .derivatives import pick
-from .signature import Structure
+from .signature import DAEStructure
 
 
 class Gather(NamedTuple):
-    """`scale * (z, w)[index]`, zero where the index is negative."""
+    """Maps vectors to `scale * (z, w)[index]`, zero where the index is negative."""
 
     index: np.ndarray
     scale: np.ndarray
 
     def __call__(self, z: Float[Array, " a"], w: Float[Array, " b"] | None) -> Float[Array, " n"]:
-        """`w = None` for zeros."""
+        """Apply the map; `w = None` stands for zeros."""
         source = z if w is None else jnp.concatenate([z, w])
         index = np.where(self.index < source.shape[0], self.index, -1)
         picked = pick(source, index)
@@ -27,12 +27,12 @@ class Gather(NamedTuple):
         return picked * jnp.asarray(self.scale, z.dtype)
 
 
-class Layout(NamedTuple):
-    """The layout of the state `z`: for each number the derivative and the unknown under whose name
-    it goes (`names`), and for each that is left of the unknowns the place of its derivatives below
-    `d_j` (`places[m, j]`, then that of `x_j^(d_j)` in the leading derivatives `w`, behind `z`)."""
+class StateLayout(NamedTuple):
+    """The layout of the state `z`. `names` has for each of its numbers the derivative and the unknown
+    whose name it has; `places` for each unknown that is left where its derivatives are: below `d_j` in
+    `z`, and `x_j^(d_j)` in the leading derivatives `w`, which are counted after `z`."""
 
-    structure: Structure
+    structure: DAEStructure
     aliases: Aliases
     names: np.ndarray  # (states, 2): derivative, unknown
     places: np.ndarray  # (levels, roots)
@@ -42,8 +42,7 @@ class Layout(NamedTuple):
         return len(self.names)
 
     def leading_names(self) -> np.ndarray:
-        """Return the names of the leading derivatives, each under the name with the fewest
-        derivatives."""
+        """Return derivative and unknown for each leading derivative, by the name of lowest order."""
         found = []
         for j, root in enumerate(self.aliases.roots.tolist()):
             order = self.structure.d[j] - self.aliases.shift
@@ -53,8 +52,8 @@ class Layout(NamedTuple):
         return np.array(found, int).reshape(-1, 2)
 
     @staticmethod
-    def of(structure: Structure, aliases: Aliases, order: int) -> "Layout":
-        """The user's own unknowns first, in their order, then derivatives without a name."""
+    def of(structure: DAEStructure, aliases: Aliases, order: int) -> "StateLayout":
+        """Put the user's own unknowns first, in their order, then derivatives without a name."""
         n, d = len(aliases.root), structure.d
         places = np.full((int(d.max(initial=0)) + 1, len(d)), -1)
         names = []
@@ -65,17 +64,17 @@ class Layout(NamedTuple):
                     places[m, j] = len(names)
                     names.append((k, unknown))
         places[d, np.arange(len(d))] = len(names) + np.arange(len(d))
-        return Layout(structure, aliases, np.array(names, int).reshape(-1, 2), places)
+        return StateLayout(structure, aliases, np.array(names, int).reshape(-1, 2), places)
 
     def scale(self) -> np.ndarray:
-        """A state is that many times the derivative of the unknown that is left."""
+        """The factor of each state relative to the derivative of its root."""
         return self.aliases.factor[self.names[:, 1]]
 
     def _scales(self) -> np.ndarray:
         return np.concatenate([self.scale(), np.ones(len(self.structure.d))])
 
     def jet(self, k: int, further: int = 0) -> Gather:
-        """Derivative `k` of all unknowns, with `further` derivatives of `w` known (behind it)."""
+        """Return the map to derivative `k` of all unknowns, with `further` derivatives of `w` after it."""
         d, j = self.structure.d, self.aliases.columns
         level = k + self.aliases.shift
         inside = level < len(self.places)
@@ -87,12 +86,12 @@ class Layout(NamedTuple):
         return Gather(index, self.aliases.factor / scales[index])
 
     def most_beyond(self, k: int) -> int:
-        """Derivatives of `w` that derivative `k` of all unknowns takes."""
+        """Return how many derivatives of `w` derivative `k` of all unknowns requires."""
         highest = self.structure.d[self.aliases.columns]
         return max(0, int((k + self.aliases.shift - highest).max(initial=0)))
 
     def rate(self) -> Gather:
-        """The derivative of the state."""
+        """Return the map from `(z, w)` to the derivative of the state."""
         level, unknown = self.names.T
         index = self.places[level + self.aliases.shift[unknown] + 1, self.aliases.columns[unknown]]
         return Gather(index, self.scale() / self._scales()[index])

@@ -2,8 +2,12 @@
 
     z - z_guess + W^-1 G(z)^T lambda = 0,  g(t, z, args) = 0
 
-is solved for `z` and `lambda`, and differentiated as the root that it is: the guess may be far
-from the manifold, where the derivative depends on how the manifold is curved.
+is solved for `z` and `lambda`, and differentiated as its root: the guess may be far from the manifold,
+where the derivative depends on the curvature of the manifold.
+
+Lifted unknowns are those that became states because an equation is a nonlinear function of them, like
+the voltage of a diode. They do not count for the distance: first the other states are moved, by the
+equations without lifting, then the lifted ones follow from them.
 """
 
 from typing import NamedTuple
@@ -25,19 +29,19 @@ from .._linalg.rows import combine, multiply
 from .reduced import Reduced
 
 
-# Of an iteration that gains a factor each time.
+# Limit for a linearly convergent iteration.
 _MAX_STEPS = 300
 
 
 class Constrained(eqx.Module):
-    """`g(z) = 0`, of what holds without the unknowns that became states, and what may move: the
-    diagonal of `W^-1`, 0 for what is fixed."""
+    """The constraints `g(z) = 0` without the equations of lifted unknowns, and the diagonal `free` of
+    `W^-1`, 0 for components that are fixed."""
 
     system: Reduced
     t: Array
     args: Args
     free: Float[Array, " n"]
-    w: Float[Array, " k"]  # a guess
+    w: Float[Array, " k"]  # a guess of the leading derivatives
 
     def __call__(self, z: Float[Array, " n"]) -> Float[Array, " m"]:
         c = self.system.analysis.unlifted.c
@@ -45,20 +49,20 @@ class Constrained(eqx.Module):
 
 
 class _Approach(NamedTuple):
-    """The search for the nearest point: the state, its multipliers, how far they are from
-    stationary, and the part of the step across the manifold that is taken."""
+    """Iterate of the search for the nearest point: the state, its multipliers, the size of the last
+    step, and the damping of steps across the manifold."""
 
     z: Float[Array, " n"]
     multipliers: Float[Array, " m"]
-    level: FloatScalar
+    last_step: FloatScalar
     damping: FloatScalar
     iterations: IntScalar
 
 
 def _approach(g: Constrained, guess: Float[Array, " n"], m: int) -> _Approach:
-    """Across the manifold by Gauss-Newton steps, smaller ones while the residual grows, and along
-    it by half the distance that a flat manifold would ask for: that converges up to three radii
-    of curvature away, and needs no second derivatives."""
+    """Approach the nearest point: across the manifold by Gauss-Newton steps, shorter ones while the
+    residual grows, and along it by half the distance to the nearest point of the tangent space. That
+    converges up to three radii of curvature away, and needs no second derivatives."""
     g, guess = without_derivative((g, guess))
     rounding = float(jnp.finfo(guess.dtype).eps)
 
@@ -74,13 +78,13 @@ def _approach(g: Constrained, guess: Float[Array, " n"], m: int) -> _Approach:
         z = state.z - state.damping * step
         better = there | (jnp.max(jnp.abs(g(z))) < jnp.max(jnp.abs(r)))
         z = jnp.where(better, z, state.z) + jnp.where(there, along / 2, 0)
-        level = jnp.maximum(jnp.max(jnp.abs(along)), jnp.max(jnp.abs(step)))
-        damping = jnp.where(better, jnp.ones_like(level), state.damping / 4)
-        return _Approach(z, multipliers, level, damping, state.iterations + 1)
+        last_step = jnp.maximum(jnp.max(jnp.abs(along)), jnp.max(jnp.abs(step)))
+        damping = jnp.where(better, jnp.ones_like(last_step), state.damping / 4)
+        return _Approach(z, multipliers, last_step, damping, state.iterations + 1)
 
     def unfinished(state: _Approach) -> BoolScalar:
         size = 1 + jnp.max(jnp.abs(state.z))
-        return (state.level > rounding * size) & (state.iterations < _MAX_STEPS)
+        return (state.last_step > rounding * size) & (state.iterations < _MAX_STEPS)
 
     one, none = jnp.ones((), guess.dtype), jnp.zeros((m,), guess.dtype)
     start = _Approach(guess, none, jnp.inf * one, one, jnp.zeros((), jnp.int32))
@@ -88,7 +92,7 @@ def _approach(g: Constrained, guess: Float[Array, " n"], m: int) -> _Approach:
 
 
 class NearestState(NamedTuple):
-    """The nearest state with its multipliers, and whether the iteration came to an end."""
+    """The nearest state with its multipliers, and whether the iteration converged."""
 
     z: Float[Array, " n"]
     multipliers: Float[Array, " m"]
@@ -97,7 +101,7 @@ class NearestState(NamedTuple):
 
 
 def nearest_state(g: Constrained, guess: Float[Array, " n"]) -> NearestState:
-    """Return the state nearest to the guess. Unknowns that became states stay where they are."""
+    """Return the state nearest to the guess. Lifted unknowns stay where they are."""
     m = int(g.system.analysis.unlifted.c.sum())
     if m == 0:
         none = jnp.zeros((0,), guess.dtype)
@@ -113,20 +117,21 @@ def nearest_state(g: Constrained, guess: Float[Array, " n"]) -> NearestState:
     found = jnp.concatenate([near.z, near.multipliers])
     root = implicit_root(SquareSystem(convert_closure(stationarity, found)), found)
     size = 1 + jnp.max(jnp.abs(near.z))
-    settled = near.level <= float(jnp.finfo(guess.dtype).eps) ** 0.5 * size
+    settled = near.last_step <= float(jnp.finfo(guess.dtype).eps) ** 0.5 * size
     return NearestState(root[: guess.size], root[guess.size :], near.iterations, settled)
 
 
 def _polished(equations: SquareSystem, start: Float[Array, " k"]) -> Float[Array, " k"]:
-    """Improve a root by Newton's steps as long as each is less than half the one before: currents
-    of 1e-12 solve their equations to rounding beside 1 with half their digits."""
+    """Improve a root by Newton's steps as long as each is less than half the one before. A residual at
+    rounding level is not enough: beside terms of size 1, a current of 1e-12 has only half of its
+    digits."""
     equations, start = without_derivative((equations, start))
 
     def advance(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-        z, level, _ = state
+        z, last_step, _ = state
         dz = equations.linearize(z).solve(equations.residual(z))
         size = jnp.max(jnp.abs(dz) / jnp.maximum(jnp.abs(z), jnp.finfo(z.dtype).tiny))
-        smaller = size < level / 2
+        smaller = size < last_step / 2
         return jnp.where(smaller, z - dz, z), size, smaller & (size > 0)
 
     first = start, jnp.asarray(jnp.inf, start.dtype), jnp.asarray(True)
@@ -134,7 +139,7 @@ def _polished(equations: SquareSystem, start: Float[Array, " k"]) -> Float[Array
 
 
 def with_lifted(system: Reduced, t: Array, z: Float[Array, " n"], args: Args) -> Float[Array, " n"]:
-    """Return the state with the unknowns that became states as they follow from the others."""
+    """Return the state with its lifted unknowns computed from the others."""
     layout, unlifted = system.analysis.layout, system.analysis.unlifted
     order, unknown = layout.names.T
     d = unlifted.d[layout.aliases.columns[unknown]]

@@ -1,4 +1,4 @@
-"""Which derivative of which unknown is in which equation, and with a constant coefficient or not."""
+"""The occurrence of derivatives of unknowns in equations, with constant coefficients or not."""
 
 from typing import Any, NamedTuple
 
@@ -11,23 +11,22 @@ from jaxtyping import Array
 from .._base.types import Args
 from .._jaxpr.incidence import incidence
 from .derivatives import pick
-from .equations import Equations
+from .equations import ResidualEquations
 
 
 class Example(NamedTuple):
-    """Equations, and where they are evaluated: a time, the vectors `(x, x', ...)` and parameters, of
-    which the arrays can be traced."""
+    """Equations and a point at which they are evaluated: a time, the vectors `(x, x', ...)` and
+    parameters, whose arrays can be traced."""
 
-    equations: Equations
+    equations: ResidualEquations
     t: Array
     jets: tuple[Array, ...]
     args: Any
     fixed_args: Any
 
     @staticmethod
-    def of(equations: Equations, x: Array, args: Args) -> "Example":
-        """With derivatives of zero. Floats in `args` are parameters like arrays are; whole numbers
-        and everything else are taken as they are."""
+    def of(equations: ResidualEquations, x: Array, args: Args) -> "Example":
+        """Take zero derivatives. Floats in `args` are parameters like arrays; all else is constant."""
         is_parameter = lambda leaf: eqx.is_inexact_array_like(leaf) or eqx.is_array(leaf)
         traced, fixed = eqx.partition(args, is_parameter)
         traced = jax.tree_util.tree_map(jnp.asarray, traced)
@@ -39,15 +38,15 @@ class Example(NamedTuple):
 
 
 def tracked(tree: Any, inputs: np.ndarray) -> tuple[Any, np.ndarray]:
-    """For `incidence`: every number of `tree` counts as these inputs."""
+    """Return `tree` with the inputs as which all its numbers count, for `incidence`."""
     size = sum(int(np.size(leaf)) for leaf in jax.tree_util.tree_leaves(tree))
     return tree, np.tile(inputs, (size, 1))
 
 
 class Occurrence(NamedTuple):
-    """`there[i, k, j]`: derivative `k` of unknown `j` is in equation `i`; `varies[i, k, j]`: its
-    coefficient there is not the same everywhere. `depends_on_time` and `on_args` say so of the
-    equations, `coefficients_vary` if any coefficient depends on anything, parameters included."""
+    """`there[i, k, j]`: derivative `k` of unknown `j` occurs in equation `i`; `varies[i, k, j]`: its
+    coefficient there is not constant. `depends_on_time` and `depends_on_args` hold for equations as a
+    whole, `coefficients_vary` if any coefficient depends on anything, parameters included."""
 
     there: np.ndarray
     varies: np.ndarray
@@ -58,7 +57,7 @@ class Occurrence(NamedTuple):
 
     @staticmethod
     def of(example: Example) -> "Occurrence":
-        """The time and all parameters together count as one input each, after those of the jets."""
+        """Find the occurrence; time and parameters are one input each, after those of the jets."""
         shape = n, levels, _ = example.equations.n, example.equations.order + 1, example.equations.n
         each = np.eye(n * levels, n * levels + 2, dtype=bool)
         time, parameters = np.eye(2, n * levels + 2, n * levels, dtype=bool)
@@ -66,8 +65,8 @@ class Occurrence(NamedTuple):
         inputs = tracked(example.t, time), (example.jets, each), args
 
         def rate(t: Array, jets: tuple[Array, ...], args: Any, dt: Array, rates: Any) -> Array:
-            """Where it does not depend on a number, the coefficient of that number is constant:
-            second derivatives are symmetric."""
+            """Return the derivative along a direction. If it does not depend on a number, the
+            coefficient of that number is constant: second derivatives are symmetric."""
             along = lambda t, jets: example.residual(t, jets, args)
             return jax.jvp(along, (t, jets), (dt, rates))[1]
 
@@ -84,8 +83,8 @@ class Occurrence(NamedTuple):
         )
 
     def without(self, before: "Occurrence", gone: dict[int, np.ndarray]) -> "Occurrence":
-        """Return the occurrence in equations of which some were replaced: `gone[row][k, j]` is not
-        in them, the others are those of `before`."""
+        """Return the occurrence after some equations were replaced: `gone[row][k, j]` does not occur in
+        them, the other equations are those of `before`."""
         there = before.there.copy()
         for row, away in gone.items():
             there[row] = self.there[row] & ~away
@@ -93,8 +92,8 @@ class Occurrence(NamedTuple):
 
 
 def nonlinear_unknowns(example: Example, levels: np.ndarray, unknowns: np.ndarray) -> np.ndarray:
-    """Return in which of the derivatives `levels` of the `unknowns`, which are changed together,
-    each equation is not linear: shape `(n, number)`."""
+    """Return in which of the derivatives `levels` of the `unknowns`, which are changed together, each
+    equation is nonlinear: shape `(n, number)`."""
     n, number = example.equations.n, len(levels)
     leading = jnp.zeros(number, example.jets[0].dtype)
 

@@ -1,4 +1,4 @@
-"""From equations to a vector field on a manifold."""
+"""The front end: from equations to a vector field on a manifold."""
 
 from collections.abc import Callable
 from typing import Any, get_args, Literal, TypeAlias
@@ -13,7 +13,7 @@ from .._base.numbers import with_arrays
 from .._base.types import Args, Y
 from .analysis import Analysis
 from .combined import without_cancellations
-from .equations import Equations, listed, Names
+from .equations import listed, Names, ResidualEquations
 from .occurrence import Example, Occurrence
 from .reduced import Reduced
 from .report import DAEReport
@@ -68,11 +68,11 @@ def reduce_dae(
     - `x_example`: a pytree of real floating-point arrays like `x`, with numbers at which `F` is
         defined. They need not be consistent.
     - `args_example`: parameters like those that will be used. Their values decide nothing but
-        whether the reduced equations are regular; arrays closed over by `F` are constants, whose
+        whether the reduced equations are nonsingular; arrays closed over by `F` are constants, whose
         zeros count as structure.
     - `order`: the highest derivative among the arguments of `F`, 1 to 3.
     - `form`: `"ode"` solves for the derivatives, for any solver. `"index-1"` leaves the equations for
-        them to [`Rodas5P`][], as unknowns of their own behind the state: for stiff equations, and
+        them to [`Rodas5P`][], as unknowns of their own after the state: for stiff equations, and
         where they are nonlinear in their highest derivatives or multipliers (friction, diodes),
         which then need not become states.
 
@@ -102,7 +102,7 @@ def reduce_dae(
         raise ValueError(f"`form` must be 'ode' or 'index-1', got {form!r}.")
     _check_concrete(x_example, args_example)
     args_example = with_arrays(args_example)  # as they will be used
-    equations = Equations.of(F, x_example, args_example, order)
+    equations = ResidualEquations.of(F, x_example, args_example, order)
     x = jfu.ravel_pytree(jtu.tree_map(jnp.asarray, x_example))[0]
     example = Example.of(equations, x, args_example)
     occurrence = Occurrence.of(example)

@@ -17,7 +17,7 @@ from .._constraint.constraint import AbstractConstraint
 from .._constraint.residual import as_time
 from .._linalg.newton import implicit_root
 from .analysis import Analysis
-from .equations import Equations
+from .equations import ResidualEquations
 from .highest_derivatives import HighestDerivatives
 
 
@@ -28,17 +28,17 @@ _SINGULAR = (
 
 
 class Reduced(eqx.Module):
-    """Equations with their analysis, all that the parts of a system share."""
+    """Equations with their analysis, shared by all parts of a reduced system."""
 
-    equations: Equations
+    equations: ResidualEquations
     analysis: Analysis = eqx.field(static=True)
 
-    def closing(self, t: Any, z: Array, args: Args) -> HighestDerivatives:
+    def leading_equations(self, t: Any, z: Array, args: Args) -> HighestDerivatives:
         return HighestDerivatives(self.equations, as_time(t, z.dtype), z, args, self.analysis)
 
     def split(self, y: Y) -> tuple[Array, Array | None]:
-        """The state `z`, and the leading derivatives where they belong to it. Refuses what is no state,
-        such as the unknowns of the user's equations."""
+        """Return the state `z`, and the leading derivatives if they belong to it. Refuse what is not a
+        state, such as the unknowns of the user's equations."""
         check_state(y, "z")
         states, implicit = self.analysis.layout.num_states, self.analysis.implicit
         size = states + len(self.analysis.c) * implicit
@@ -50,9 +50,9 @@ class Reduced(eqx.Module):
         return (y[:states], y[states:]) if implicit else (y, None)
 
     def field(self, t: RealScalarLike, y: Float[Array, " states"], args: Args) -> Array:
-        """The vector field on the state.
+        """Return the vector field on the state.
 
-        In the form of index 1 the leading derivatives are unknowns `w` of their own behind the state,
+        In the form of index 1 the leading derivatives are unknowns `w` of their own after the state,
 
             z' = (z, w),   0 = F_i^(c_i)(t, z, w),
 
@@ -60,10 +60,10 @@ class Reduced(eqx.Module):
         vector field: a Rosenbrock method does both at once.
         """
         z, w = self.split(y)
-        closing, rate = self.closing(t, z, args), self.analysis.layout.rate()
+        leading, rate = self.leading_equations(t, z, args), self.analysis.layout.rate()
         if w is None:
-            return rate(z, closing.solve())
-        return jnp.concatenate([rate(z, w), closing.residual(w)])
+            return rate(z, leading.solve())
+        return jnp.concatenate([rate(z, w), leading.residual(w)])
 
     def hidden_constraints(
         self,
@@ -74,9 +74,9 @@ class Reduced(eqx.Module):
         end: np.ndarray,
         w: Float[Array, " n"] | None = None,
     ) -> Float[Array, " m"]:
-        """`F_i^(k)` for `first_i <= k < end_i`. Leading derivatives `w` like those that belong to `z` are
-        for the size of what cancels in combinations of equations. Without these the example serves better:
-        there all that these equations do not depend on is known to be finite, with its slopes."""
+        """Return `F_i^(k)` for `first_i <= k < end_i`. They do not depend on the leading derivatives
+        `w`, but where these cancel in combinations of equations their size matters: give `w` like those
+        of `z`. Without combinations the example is used, where everything is finite."""
         order = int(end.max(initial=0)) - 1
         if order < 0:
             return jnp.zeros((0,), z.dtype)
@@ -87,14 +87,14 @@ class Reduced(eqx.Module):
     def unknowns_with_derivatives(
         self, t: RealScalarLike, y: Float[Array, " states"], args: Args, number: int
     ) -> list[Float[Array, " n"]]:
-        """`x, x', ...` up to that derivative, by differentiating along the solution."""
+        """Return `x, x', ...` up to derivative `number`, by differentiating along the solution."""
         layout = self.analysis.layout
         z, w = self.split(y)
-        w = self.closing(t, z, args).solve() if w is None else w
+        w = self.leading_equations(t, z, args).solve() if w is None else w
 
         def leading(t: Array, z: Array) -> Array:
-            """Solved for only once: nearby, the same as the function that the equations define."""
-            return implicit_root(self.closing(t, z, args), w)
+            """Return the leading derivatives as a function, without solving for them again."""
+            return implicit_root(self.leading_equations(t, z, args), w)
 
         def differentiated(function: Callable) -> Callable:
             along = lambda t, z: (jnp.ones_like(t), layout.rate()(z, leading(t, z)))
@@ -110,8 +110,8 @@ class Reduced(eqx.Module):
 
 
 class ReducedConstraint(AbstractConstraint):
-    """`F_i = 0, F_i' = 0, ..., F_i^(c_i - 1) = 0`: what the equations and their derivatives say
-    of the state alone. Lower derivatives first. Built by `reduce_dae`."""
+    """`F_i = 0, F_i' = 0, ..., F_i^(c_i - 1) = 0`: the constraints that the equations and their
+    derivatives impose on the state alone. Lower derivatives first. Built by `reduce_dae`."""
 
     system: Reduced
     redundant: bool = eqx.field(static=True, default=False)
@@ -122,5 +122,5 @@ class ReducedConstraint(AbstractConstraint):
 
     def faults(self, t, y, args=None) -> tuple[tuple[BoolScalar, str], ...]:
         z, w = self.system.split(jfu.ravel_pytree(y)[0])
-        closing = self.system.closing(t, z, args)
-        return ((~closing.linearize(z if w is None else w).full_rank, _SINGULAR),)
+        matrix = self.system.leading_equations(t, z, args).linearize(z if w is None else w)
+        return ((~matrix.usable, _SINGULAR),)

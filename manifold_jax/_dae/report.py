@@ -1,4 +1,4 @@
-"""What the reduction found, for people."""
+"""The report of a reduction."""
 
 import dataclasses
 
@@ -9,7 +9,7 @@ from .equations import listed
 from .signature import ABSENT
 
 
-# Equations and unknowns up to which the whole signature matrix is printed.
+# Largest number of equations and unknowns for which the whole signature matrix is printed.
 _MOST_PRINTED = 16
 
 
@@ -22,8 +22,7 @@ class DAEReport:
         equation, -1 where it is absent.
     - `c`, `d`: the offsets, `(n,)` each: how often each equation is differentiated, and up to which
         derivative each unknown then occurs.
-    - `index`: the structural index, `max c`, and one more where an unknown is only found
-        algebraically.
+    - `index`: the structural index, `max c`, and one more where an unknown is only found algebraically.
     - `degrees_of_freedom`: `sum d - sum c`, how many initial values are free.
     - `states`: names of the numbers of the state; `num_constraints` equations hold of them.
     - `dropped`: equations like `x' - v = 0`, which are solved by name.
@@ -96,7 +95,7 @@ class DAEReport:
         return "\n".join(lines)
 
     def _matrix(self) -> list[str]:
-        """The signature matrix with the offsets beside and below it."""
+        """Format the signature matrix with the offsets beside and below it."""
         sigma = np.where(self.sigma < 0, ".", self.sigma.astype(str))
         columns = [
             [name, *entries, str(d)]

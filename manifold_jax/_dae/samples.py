@@ -1,4 +1,4 @@
-"""The matrix of the leading derivatives at a few points: is it regular?"""
+"""Samples of the matrix of the leading derivatives, to decide whether it is nonsingular."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -7,11 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from .layout import Layout
+from .layout import StateLayout
 from .occurrence import Example
 
 
-# How far from the example, relative and absolute: where the equations are not defined, nearer.
+# Distance from the example, relative and absolute; smaller where the equations are not defined.
 _DISTANCES = (0.5, 0.5, 0.5, 0.1, 0.01, 1e-3)
 
 
@@ -26,8 +26,8 @@ class Samples(NamedTuple):
         return max(self.conditions) < singular_below(self.matrices[0].dtype)
 
     @staticmethod
-    def of(matrix: Callable, example: Example, layout: Layout) -> "Samples":
-        """`matrix(t, y, args)`, of the states and the leading derivatives behind them."""
+    def of(matrix: Callable, example: Example, layout: StateLayout) -> "Samples":
+        """Take samples of `matrix(t, y, args)`; `y` has the states and then the leading derivatives."""
         matrices = []
         for t, y in _points(layout, np.asarray(example.jets[0])):
             sample = np.asarray(matrix(t, jnp.asarray(y), example.args))
@@ -45,7 +45,7 @@ def singular_below(dtype: np.dtype) -> float:
     return float(np.finfo(dtype).eps) ** 0.75
 
 
-def _points(layout: Layout, x: np.ndarray) -> list[tuple[Array, np.ndarray]]:
+def _points(layout: StateLayout, x: np.ndarray) -> list[tuple[Array, np.ndarray]]:
     random = np.random.default_rng(0)
     order, unknown = np.concatenate([layout.names, layout.leading_names()]).T
     found = []
@@ -71,7 +71,7 @@ def condition(matrix: np.ndarray) -> float:
 
 
 def dependent_rows(matrix: np.ndarray) -> np.ndarray:
-    """Which rows of a singular matrix take part in its dependence."""
+    """Return the rows of a singular matrix that are part of the linear dependence."""
     left, values, _ = np.linalg.svd(equilibrated(matrix))
     null = left[:, values <= 1e3 * singular_below(matrix.dtype) * values[0]]
     return np.nonzero(np.abs(null).max(axis=1, initial=0) > 1e-6)[0]

@@ -15,10 +15,11 @@ from scipy.sparse.csgraph import maximum_bipartite_matching
 ABSENT = -(10**6)
 
 
-class Structure(NamedTuple):
-    """A signature matrix `sigma_ij`, the highest derivative of unknown `j` in equation `i`, with
-    the offsets `c_i` (differentiations of equation `i`) and `d_j` (highest derivative of unknown
-    `j` then), the smallest with `d_j - c_i >= sigma_ij`, equal on the transversal."""
+class DAEStructure(NamedTuple):
+    """A signature matrix `sigma_ij`, the order of the highest derivative of unknown `j` in equation
+    `i`, with the smallest offsets `c_i` (differentiations of equation `i`) and `d_j` (order of the
+    highest derivative of unknown `j` afterwards) with `d_j - c_i >= sigma_ij`, and equality on the
+    transversal."""
 
     sigma: np.ndarray
     transversal: np.ndarray  # the unknown that belongs to each equation
@@ -27,7 +28,7 @@ class Structure(NamedTuple):
 
     @property
     def leading(self) -> np.ndarray:
-        """Where the equations, differentiated `c_i` times, have the derivatives `d_j`."""
+        """The entries where the equations, differentiated `c_i` times, contain the derivatives `d_j`."""
         return self.d[None, :] - self.c[:, None] == self.sigma
 
     @property
@@ -36,14 +37,14 @@ class Structure(NamedTuple):
 
     @property
     def index(self) -> int:
-        """Differentiations until the equations are an ordinary differential equation of all
-        unknowns: one more where an unknown is only found algebraically."""
+        """The number of differentiations until the equations are an ordinary differential equation of
+        all unknowns: one more than `max c` if an unknown is only found algebraically."""
         return int(self.c.max(initial=0)) + int((self.d == 0).any())
 
     @staticmethod
-    def of(sigma: np.ndarray, at_least: np.ndarray | None = None) -> "Structure | None":
-        """`None` if no assignment of unknowns to equations exists. `at_least` are lower bounds of
-        the `c_i`."""
+    def of(sigma: np.ndarray, at_least: np.ndarray | None = None) -> "DAEStructure | None":
+        """Find the offsets; return `None` if no assignment of unknowns to equations exists. `at_least`
+        are lower bounds of the `c_i`."""
         n = len(sigma)
         rows, transversal = linear_sum_assignment(sigma.astype(float), maximize=True)
         on_transversal = sigma[rows, transversal]
@@ -54,21 +55,21 @@ class Structure(NamedTuple):
             d = (sigma + c[:, None]).max(axis=0, initial=ABSENT)
             raised = np.maximum(c, d[transversal] - on_transversal)
             if (raised == c).all():
-                return Structure(sigma, transversal, c, d)
+                return DAEStructure(sigma, transversal, c, d)
             c = raised
 
 
 def signature(occurs: np.ndarray) -> np.ndarray:
-    """Return the signature matrix from `occurs[i, k, j]`: whether the derivative `k` of unknown
-    `j` is in equation `i`."""
+    """Return the signature matrix from `occurs[i, k, j]`: derivative `k` of unknown `j` in equation
+    `i`."""
     highest = occurs.shape[1] - 1 - np.argmax(occurs[:, ::-1], axis=1)
     return np.where(occurs.any(axis=1), highest, ABSENT)
 
 
 class SingularParts(NamedTuple):
-    """The parts of a matrix without a transversal (Dulmage & Mendelsohn, Canad. J. Math. 10 (1958)
-    517-534): the equations that have too few unknowns for all of them, and those unknowns; the
-    unknowns that too few equations are left for, and those equations."""
+    """The singular parts of a matrix without a transversal (Dulmage & Mendelsohn, Canad. J. Math. 10
+    (1958) 517-534): the equations that have too few unknowns for all of them, with those unknowns, and
+    the unknowns that have too few equations, with those equations."""
 
     overdetermined: tuple[np.ndarray, np.ndarray]  # equations, unknowns
     underdetermined: tuple[np.ndarray, np.ndarray]

@@ -1,4 +1,4 @@
-"""A differential-algebraic equation as a vector field on a manifold."""
+"""The reduced system that users get: a vector field on a manifold."""
 
 from typing import Any
 
@@ -17,16 +17,16 @@ from .report import DAEReport
 
 
 class ReducedDAE(eqx.Module):
-    """What [`reduce_dae`][] returns. The state `z` is a vector of shape `(states,)`; the names of
-    its numbers are `report.states`."""
+    """A reduced differential-algebraic equation, made by [`reduce_dae`][]. The state `z` is a vector of
+    shape `(states,)`; the names of its numbers are `report.states`."""
 
     system: Reduced
     report: DAEReport = eqx.field(static=True)
 
     @property
     def terms(self) -> dfx.ODETerm | MassMatrixTerm:
-        """The vector field on the state, a Diffrax term; NaN where the equations do not determine
-        it. With `form="index-1"` a [`MassMatrixTerm`][] for [`Rodas5P`][] and [`Rodas3P`][]."""
+        """The vector field on the state, a Diffrax term; NaN where the equations do not determine it.
+        With `form="index-1"` a [`MassMatrixTerm`][] for [`Rodas5P`][] and [`Rodas3P`][]."""
         analysis = self.system.analysis
         if not analysis.implicit:
             return dfx.ODETerm(self.system.field)
@@ -35,9 +35,9 @@ class ReducedDAE(eqx.Module):
 
     @property
     def constraint(self) -> ReducedConstraint:
-        """The manifold, for [`Projected`][], [`Stabilized`][] and [`LocalCoordinates`][]: what the
-        equations and their derivatives say of the state. Without equations (`num_constraints` of
-        the report is 0) `mj.diffeqsolve` uses the solver alone."""
+        """The manifold, for [`Projected`][], [`Stabilized`][] and [`LocalCoordinates`][]: the
+        constraints that the equations and their derivatives impose on the state. Without any
+        (`num_constraints` of the report is 0) `mj.diffeqsolve` uses the solver alone."""
         return ReducedConstraint(system=self.system)
 
     def consistent_state(
@@ -60,13 +60,13 @@ class ReducedDAE(eqx.Module):
         - `args`: the parameters.
         - `derivatives`: guesses for `x', x'', ...`, each like `x_guess`, for states that are derivatives
             without a name of their own; zero if not given.
-        - `fixed`: names of what must not move, of whole arrays (`"q"`, of an array alone `"x"`) or
+        - `fixed`: names of fixed unknowns, of whole arrays (`"q"`, of an array alone `"x"`) or
             numbers (`"q[0]"`), with `'` for derivatives, as in `report.states`.
         - `throw`: raise if there is no such state. With `throw=False` look at `info.success`.
 
         **Returns:**
 
-        `(z, info)`: the state, the nearest one of the manifold in what is not fixed (the root of
+        `(z, info)`: the state, the nearest one of the manifold in the unknowns that are not fixed (the root of
         `z - z_guess + W^-1 G^T lambda = 0`, `g(t0, z) = 0` with `G` at `z` itself), then unknowns that became states
         as equations are nonlinear in them, from those; and a [`ProjectionInfo`][]. The derivative
         with respect to all arguments is exact, however far the guess is.
@@ -75,18 +75,18 @@ class ReducedDAE(eqx.Module):
 
         `ValueError` for names that are not states, a guess unlike `x_example`, and a
         `RuntimeError` if no state near satisfies the equations, if they cannot be satisfied
-        with what is fixed, or if they do not determine the derivatives at the state found
+        with the fixed unknowns, or if they do not determine the derivatives at the state found
         (redundant equations, singular configurations; outside of `jit` it says which).
         """
         guess = Guess.of(self.system, x_guess, derivatives, fixed)
         return consistent_state(self.system, t0, guess, args, throw)
 
     def outputs(self, t: RealScalarLike, z: Float[Array, " states"], args: Args = None) -> Any:
-        """All unknowns and their derivatives, `(x, x', ...)`, as many as `F` takes, multipliers and
-        other algebraic unknowns included: on the manifold `F(t, *outputs, args) = 0`.
+        """Return all unknowns and their derivatives, `(x, x', ...)`, as many as `F` takes, multipliers
+        and other algebraic unknowns included: on the manifold `F(t, *outputs, args) = 0`.
 
-        Of one state; `jax.vmap(dae.outputs, in_axes=(0, 0, None))` of saved ones. Derivatives that
-        are not in the equations are found by differentiating along the solution.
+        For one state; use `jax.vmap(dae.outputs, in_axes=(0, 0, None))` for saved ones. Derivatives
+        that are not in the equations are found by differentiating along the solution.
         """
         return _outputs(self.system, t, z, args)
 
@@ -94,6 +94,6 @@ class ReducedDAE(eqx.Module):
 @numbers_as_arrays("args", times=("t",))
 @eqx.filter_jit
 def _outputs(system: Reduced, t: RealScalarLike, z: Array, args: Args) -> tuple[Any, ...]:
-    """Compiled also where it is called alone: one by one, its operations take ten times as long."""
+    """Compiled also when called alone: operation by operation it takes ten times as long."""
     found = system.unknowns_with_derivatives(t, z, args, system.equations.order)
     return tuple(system.equations.unravel(x) for x in found)

@@ -1,3 +1,3 @@
-"""Parameters of equations on manifolds from measured data."""
+"""Parameters of equations on manifolds, fitted to measured data."""
 
 from .report import FitResult as FitResult

@@ -1,8 +1,8 @@
 """Parameters that the data drive to a bound.
 
-On the way there each step of the unknowns leaves a fraction of the distance, so that the optimizer
-would never arrive. Such parameters are put on their bound, where nothing depends on their unknowns any
-more, and the others go on: an active set (Nocedal & Wright, Numerical Optimization, ch. 16).
+Each step of the unknowns leaves a fraction of the distance to the bound, so the optimizer would never
+arrive. Such parameters are put on their bound, where nothing depends on their unknowns any more, and
+the others go on: an active set (Nocedal & Wright, Numerical Optimization, ch. 16).
 """
 
 from typing import Any
@@ -13,22 +13,23 @@ from .objective import Objective, Solved, stacked, Unknowns
 from .parameters import LARGEST, Transform
 
 
-# Of the way from the start to a bound, what may be left of it: for derivatives to be asked, and where
-# there are none.
+# The distance to a bound, as a fraction of that at the start, at which a parameter is tested by
+# derivatives, and at which it is put on the bound without derivatives.
 _NEAR, _NEXT_TO = 1e-2, 1e-3
-# There derivatives are asked whether a parameter belongs on its bound.
+# The same fraction, at which derivatives decide whether a parameter belongs on its bound.
 BESIDE = 1e-6
 
 
 def at_bounds(u: Unknowns, solved: Solved, objective: Objective) -> np.ndarray:
-    """Which parameters ended at the lower (-1) or the upper bound (1), `(p,)`."""
+    """Return which parameters ended at the lower (-1) or the upper bound (1), shape `(p,)`."""
     if objective.loss is not None or solved.matrices is None:
         return _near(u, objective.transform, _NEXT_TO)
     return driven(u, solved, objective)
 
 
 def driven(u: Unknowns, solved: Solved, objective: Objective) -> np.ndarray:
-    """Which are on a bound, or near it and would be there if the problem were linear, likewise."""
+    """Return which parameters are on a bound, or near one that they would reach if the problem were
+    linear, shape `(p,)`."""
     side = _near(u, objective.transform, _NEAR)
     if objective.loss is not None or solved.matrices is None or not np.any(side):
         return np.zeros_like(side)
@@ -38,7 +39,7 @@ def driven(u: Unknowns, solved: Solved, objective: Objective) -> np.ndarray:
 
 
 def on_bounds(u: Unknowns, transform: Transform) -> np.ndarray:
-    """Which have been put on a bound, likewise."""
+    """Return which parameters have been put on a bound, shape `(p,)`."""
     held = np.abs(np.asarray(u[: transform.start.size])) > LARGEST
     return np.where(held, _near(u, transform, _NEXT_TO), 0)
 
@@ -49,7 +50,7 @@ def put_on_bounds(u: Unknowns, side: np.ndarray) -> Unknowns:
 
 
 def put_beside_bounds(u: Unknowns, side: np.ndarray, left: Any, transform: Transform) -> Unknowns:
-    """Return the unknowns with a small part `left` of the way from the start to the bound."""
+    """Return the unknowns with the fraction `left` of the distance from the start to the bound."""
     s, a, b = (np.asarray(x) for x in (transform.start, transform.lower, transform.upper))
     width = np.where(np.isfinite(b - a), b - a, 1.0)
     other = np.where(np.isfinite(b - a), np.where(side < 0, b - s, s - a), 1.0)
@@ -71,7 +72,7 @@ def _near(u: Unknowns, transform: Transform, left: float) -> np.ndarray:
 
 
 def linear_step(u: Any, solved: Solved, objective: Objective) -> np.ndarray:
-    """The step of Gauss and Newton, `(N,)`."""
+    """Return the Gauss-Newton step, shape `(N,)`."""
     J, r = stacked(u, solved, objective)
     size = np.linalg.norm(J, axis=0)
     size[size == 0] = 1.0

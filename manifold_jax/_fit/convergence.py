@@ -1,4 +1,4 @@
-"""When a fit is over, apart from what its optimizer says."""
+"""Convergence tests of a fit, in addition to those of its optimizer."""
 
 from typing import Any
 
@@ -8,7 +8,7 @@ import optimistix as optx
 from .objective import Objective, Solved, stacked, Unknowns
 
 
-# What is left to a step, of what the noise of the data moves the minimum by.
+# Largest relative offset of a converged fit: the remaining step relative to the effect of noise.
 _OFFSET = 1e-5
 _TRIALS = 3
 
@@ -28,22 +28,22 @@ def flat(losses: list[float]) -> bool:
 def at_minimum(
     losses: list[float], u: Unknowns, solved: Solved, objective: Objective, solver: Any
 ) -> bool:
-    """Whether steps are refused at the minimum, where errors of the solves are larger than what there
-    is left to gain."""
+    """Whether steps are rejected because the errors of the solves exceed the possible gain."""
     if not isinstance(solver, optx.AbstractLeastSquaresSolver) or not stalled(losses, _TRIALS):
         return False
     return relative_offset(*stacked(u, solved, objective)) <= _OFFSET
 
 
 def relative_offset(J: np.ndarray, r: np.ndarray) -> float:
-    r"""The residuals `(n,)` along the columns of their Jacobian `(n, N)` against those across,
+    r"""Return the size of the residuals `(n,)` in the range of their Jacobian `(n, N)`, relative to the
+    rest of them,
 
     $$\sqrt{\frac{\lVert P r\rVert^2 / N}{\lVert r - P r\rVert^2 / (n - N)}},$$
 
     infinite for as many unknowns as residuals. Source: Bates & Watts, A relative offset orthogonality
     convergence criterion for nonlinear least squares, Technometrics 23 (1981) 179-183.
     """
-    # Neither what was not measured, nor the constants that stand for records whose solves failed.
+    # Without missing values and the constants that stand for records whose solves failed.
     known = np.any(J != 0, axis=1)
     J, r = J[known][:, np.any(J != 0, axis=0)], r[known]
     n, N = J.shape

@@ -20,14 +20,14 @@ class Records(NamedTuple):
     weights: np.ndarray  # (R, T, k)
     t0: np.ndarray  # (R,)
     many: bool
-    absolute: bool  # whether the user knows `sigma`
+    absolute: bool  # whether `sigma` was given
     observed: Any  # shapes of one observation
 
 
 def make_records(
     ts: Any, data: Any, sigma: Any, missing: str | None, t0: Any, observed: Any
 ) -> Records:
-    """Check and flatten; `observed` are the shapes of one observation."""
+    """Check and flatten the measurements; `observed` has the shapes of one observation."""
     if missing not in (None, "nan"):
         raise ValueError(f"`missing` must be 'nan' or None, got {missing!r}.")
     ts = np.asarray(ts, float)
@@ -66,7 +66,7 @@ def check_times(ts: Any) -> None:
 
 
 def flatten(data: Any, lead: tuple[int, ...], observed: Any, name: str) -> np.ndarray:
-    """Leaves of shape `lead + s` as one array `lead + (k,)`."""
+    """Return leaves of shape `lead + s` as one array `lead + (k,)`."""
     if jtu.tree_structure(data) != jtu.tree_structure(observed):
         raise ValueError(
             f"`{name}` must have the structure of what is observed at one time, "
@@ -117,7 +117,7 @@ def _check_values(values: np.ndarray, missing: str | None) -> np.ndarray:
 
 
 def filled_in_time(records: Records) -> np.ndarray:
-    """The data with missing values interpolated linearly in time, `(R, T, k)`."""
+    """Return the data with missing values interpolated linearly in time, shape `(R, T, k)`."""
     filled = records.data.copy()
     for r, k in np.ndindex(filled.shape[0], filled.shape[2]):
         known = records.weights[r, :, k] > 0
@@ -131,7 +131,7 @@ def filled_in_time(records: Records) -> np.ndarray:
 
 
 def unflatten(flat: np.ndarray, observed: Any) -> Any:
-    """The inverse of `flatten`."""
+    """Invert `flatten`."""
     leaves, structure = jtu.tree_flatten(observed)
     ends = np.cumsum([leaf.size for leaf in leaves])[:-1]
     parts = np.split(flat, ends, axis=-1)

@@ -1,4 +1,4 @@
-"""The front end: parameters of an equation on a manifold from measured trajectories."""
+"""The front end: fits parameters of an equation on a manifold to measured trajectories."""
 
 from collections.abc import Callable
 from typing import Any
@@ -14,7 +14,7 @@ from .model import as_function_of_constraint, Simulator
 from .optimize import Options
 from .parameters import make_transform
 from .pieces import make_pieces
-from .progress import Meter
+from .progress import FitMeter
 from .report import FitResult
 from .setup import check_initial, check_options, make_objective, refuse_tracers
 from .starts import choose, draw_points, optimize_all, see, with_scales
@@ -77,7 +77,7 @@ def fit(
     - `parameters`: the values to start from, any pytree of real numbers and arrays, `p` in all.
     - `ts`: increasing times of the measurements, shape `(times,)`; or `(records, times)` for
         many trajectories with the same parameters.
-    - `data`: what was measured at `ts`, like the state (or what `observe` returns), leaves
+    - `data`: the measurements at `ts`, like the state (or what `observe` returns), leaves
         with a leading axis `(times,)` or `(records, times)`.
     - `y0`: the initial state at `t0`, with a leading axis `(records,)` if there are many; or a
         function `y0(parameters)`. It is moved onto the manifold. Default: that of the problem.
@@ -98,7 +98,7 @@ def fit(
         (`optx.BFGS`), or any Optax optimizer. Steps of the unknowns are relative to the start
         values. Prefer the default, but Optax for more than about 50 parameters (then by reverse
         mode and without standard errors) or more records than can be solved in each step.
-    - `steps`: the most of them; `patience`: stop after so many without a decrease.
+    - `steps`: the largest number of steps; `patience`: stop after so many without a decrease.
     - `batch_size`: with Optax, records in each step, in an order drawn with `seed`; `steps` then counts
         passes through all records.
     - `starts`: how many times to fit, of which the best is kept and all are listed
@@ -116,7 +116,7 @@ def fit(
     - `solver`: a Diffrax solver, wrapped in [`Projected`][], or a function of the constraint.
     - `stepsize_controller`, `dt0`, `max_steps`: as for [`diffeqsolve`][]. The default tolerance
         is 1e-8 (1e-5 in single precision).
-    - `progress`: whether to say what is being compiled and how far the steps are: by a progress bar
+    - `progress`: whether to report compilation and steps: by a progress bar
         on a terminal, by lines in a file or a notebook.
     - `throw`: whether a fit that did not end well raises; otherwise look at `result.success`.
 
@@ -158,7 +158,7 @@ def fit(
     observed = eqx.filter_eval_shape(simulator.observation, jnp.zeros(()), y, start)
     t0 = getattr(model, "t0", None) if t0 is None and hasattr(model, "with_args") else t0
     records = make_records(ts, data, sigma, missing, t0, observed)
-    meter = Meter(progress)
+    meter = FitMeter(progress)
     options = Options(optimizer, steps, patience, batch_size, seed, starts, meter)
     check_options(options, loss, segments, records)
     with meter:
@@ -182,11 +182,10 @@ def fit(
 
 
 def _unknowns(objective: Any, options: Options) -> list[Any]:
-    """Return the unknowns at all starts: those of the parameters, then those of initial states,
-    which are at their guess."""
+    """Return the unknowns at all starts: of the parameters, then of initial states (at their guess)."""
     transform, d = objective.transform, objective.pieces.basis.shape[-1]
     states = objective.free.size * d
-    # Equations at the joints determine as many unknowns as the states there are.
+    # Each joint has as many equations as the state there has unknowns.
     unknowns = transform.start.size + states - objective.joints.size * d
     values = int(jnp.sum(objective.pieces.weights > 0))
     if values < unknowns:

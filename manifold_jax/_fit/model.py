@@ -1,4 +1,4 @@
-"""From parameters to an initial value problem, and from that to predicted measurements."""
+"""Initial value problems and predicted measurements as functions of the parameters."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -23,7 +23,7 @@ from .parameters import Transform
 
 
 class Setting(NamedTuple):
-    """What one solve needs, apart from times."""
+    """The arguments of one solve, apart from times."""
 
     terms: Any
     constraint: AbstractConstraint
@@ -32,21 +32,21 @@ class Setting(NamedTuple):
 
 
 class Piece(NamedTuple):
-    """One stretch of one record, solved by itself, with `L` times, the last of which is where
-    the next stretch of that record begins. Fields have a leading axis, one entry a piece."""
+    """One stretch of one record, solved separately, with `L` times, the last of which is where the next
+    stretch of that record begins. Fields have a leading axis, one entry a piece."""
 
     start: FloatScalar
     ts: Float[Array, " L"]
     data: Float[Array, "L k"]
     weights: Float[Array, "L k"]
-    guess: Float[Array, " n"]  # of the state at `start`, where it is not that of the record
+    guess: Float[Array, " n"]  # the state at `start`, unless it is that of the record
     basis: Float[Array, "n d"]  # of the tangent space there
     first: BoolScalar
     record: IntScalar
 
 
 class Prediction(NamedTuple):
-    """What one piece gives; zeros, without derivative, where the solve failed."""
+    """The prediction for one piece; zeros, without derivative, if the solve failed."""
 
     observed: Float[Array, "L k"]
     begin: Float[Array, " n"]
@@ -55,20 +55,20 @@ class Prediction(NamedTuple):
 
 
 class Simulator(eqx.Module):
-    """The user's model with all that is not fitted."""
+    """The user's model with all arguments that are not fitted."""
 
     model: Any
     transform: Transform
     y0: Any
     observe: Callable | None
-    solver: Callable  # of the constraint, which depends on the parameters
+    solver: Callable  # maps the constraint, which depends on the parameters, to a solver
     controller: dfx.AbstractStepSizeController
     dt0: Any
     max_steps: int | None = eqx.field(static=True)
     many: bool = eqx.field(static=True)
 
     def setting(self, parameters: Any, record: Any) -> Setting:
-        """The initial value problem of one record."""
+        """Return the initial value problem of one record."""
         built = _build(self.model, parameters)
         y0 = self.y0(parameters) if callable(self.y0) else self.y0
         if y0 is None:
@@ -88,14 +88,14 @@ class Simulator(eqx.Module):
         return Setting(built.terms, built.constraint, y0, args)
 
     def given(self, record: Any = 0) -> Setting:
-        """The same with the start values of the parameters."""
+        """Return that problem with the start values of the parameters."""
         return self.setting(self.transform.unravel(self.transform.start), record)
 
     def observation(self, t: Any, y: Y, parameters: Any) -> Any:
         return y if self.observe is None else self.observe(t, y, parameters)
 
     def beginning(self, x: Float[Array, " q"], piece: Piece) -> Setting:
-        """The initial value problem of one piece; `x` as for `predict`."""
+        """Return the initial value problem of one piece; `x` as for `predict`."""
         setting = self.setting(self.transform.parameters(x), piece.record)
         base, unravel = jfu.ravel_pytree(setting.y0)
         y0 = unravel(
@@ -105,7 +105,8 @@ class Simulator(eqx.Module):
         return setting._replace(y0=y0, constraint=constraint)
 
     def predict(self, x: Float[Array, " q"], piece: Piece, adjoint: Any) -> Prediction:
-        """`x`: the unknowns of the parameters, then tangent coordinates of the initial state."""
+        """Predict the measurements of one piece; `x` are the unknowns of the parameters, then tangent
+        coordinates of the initial state."""
         setting = self.beginning(x, piece)
         parameters = self.transform.parameters(x)
         sol = diffeqsolve(
@@ -133,14 +134,14 @@ class Simulator(eqx.Module):
 
 
 def at_start(constraint: AbstractConstraint, t: Any, y: Y, args: Args) -> AbstractConstraint:
-    """Conserved quantities have the values of the state that the solve starts from."""
+    """Freeze conserved quantities at the state that the solve starts from."""
     if isinstance(constraint, Invariants):
         return Invariants(constraint.function, y0=y, t0=t, args=args)
     return constraint
 
 
 def _build(model: Any, parameters: Any) -> Any:
-    """A gallery problem, a mechanical system or `(terms, constraint)`."""
+    """Call a gallery problem, a mechanical system or a function that returns `(terms, constraint)`."""
     if hasattr(model, "with_args"):
         return model.with_args(_args_of(model, parameters))
     if isinstance(model, MechanicalSystem):
@@ -163,7 +164,7 @@ def _build(model: Any, parameters: Any) -> Any:
 
 
 def _args_of(problem: Any, parameters: Any) -> Args:
-    """The arguments of a gallery problem, some of them replaced."""
+    """Return the arguments of a gallery problem, some of them replaced."""
     if isinstance(parameters, type(problem.args)):
         return parameters
     fields = getattr(problem.args, "_fields", ())

@@ -21,15 +21,15 @@ Unknowns: TypeAlias = Float[Array, " N"]
 
 
 class Objective(eqx.Module):
-    """Everything that the unknowns are compared with.
+    """The residuals and losses of a fit.
 
-    The unknowns are one vector: those of the `p` parameters, then `d` tangent coordinates for
-    each initial state in `free`. `joints` are the pieces that go on in the next one; their
-    gaps `c` enter as `stiffness (c + shift)`, an augmented Lagrangian.
+    The unknowns are one vector: those of the `p` parameters, then `d` tangent coordinates for each
+    initial state in `free`. `joints` are the pieces that continue in the next one; their gaps `c` enter
+    as `stiffness (c + shift)`, an augmented Lagrangian.
 
-    `penalty` stands for every residual of a piece whose solve failed. It is a constant, larger
-    than any residual at the start: a step that makes solves fail is rejected, a trajectory that
-    fails all the time has no influence.
+    `penalty` stands for every residual of a piece whose solve failed. It is a constant, larger than any
+    residual at the start: a step that makes solves fail is rejected, a trajectory that always fails has
+    no influence.
     """
 
     simulator: Simulator
@@ -48,7 +48,7 @@ class Objective(eqx.Module):
         return self.simulator.transform
 
     def chosen(self, u: Unknowns, batch: Any = None) -> tuple[Any, Piece]:
-        """The unknowns of each piece, `(pieces, p + d)`, and the pieces: all, or some."""
+        """Return the unknowns of each piece, `(pieces, p + d)`, and the pieces: all, or some."""
         p, d = self.transform.start.size, self.pieces.basis.shape[-1]
         z = jnp.zeros((self.pieces.start.size, d), u.dtype)
         z = z.at[self.free].set(u[p:].reshape(self.free.size, d))
@@ -59,14 +59,14 @@ class Objective(eqx.Module):
 
 
 class Solved(NamedTuple):
-    """Predictions of all pieces and their derivatives by the unknowns `(p + d,)` of each: as
-    many sweeps for one piece, however many unknowns there are in all."""
+    """Predictions of all pieces and their derivatives with respect to the `p + d` unknowns of each: the
+    number of sweeps is that of one piece, whatever the number of unknowns in all."""
 
     values: Prediction
     matrices: Prediction | None
 
     def around(self, u: Unknowns, objective: Objective, batch: Any = None) -> Prediction:
-        """The predictions as a function of `u` that can be differentiated (once)."""
+        """Return the predictions as a function of `u` that can be differentiated (once)."""
         x, _ = objective.chosen(u, batch)
         step = x - jax.lax.stop_gradient(x)
         moved = lambda v, M: v + jax.vmap(jnp.matmul)(M, step)
@@ -74,8 +74,7 @@ class Solved(NamedTuple):
 
 
 def solve(u: Unknowns, objective: Objective, batch: Any = None) -> Solved:
-    """Solve all pieces, or those of a batch. Failed ones give zeros, so that none of their
-    values gets into a derivative."""
+    """Solve all pieces, or those of a batch. Failed ones give zeros, which enter no derivative."""
     x, pieces = objective.chosen(jax.lax.stop_gradient(u), batch)
 
     def one(x: Any, piece: Piece) -> Solved:
@@ -93,8 +92,8 @@ def solve(u: Unknowns, objective: Objective, batch: Any = None) -> Solved:
 
 
 def _each(function: Callable, x: Any, pieces: Piece) -> Any:
-    """Evaluate a function for every piece. A batch of one alone takes half as long again to trace,
-    and both branches of every condition to run."""
+    """Evaluate a function for every piece. A batch of a single piece would take half as long again to
+    trace, and would execute both branches of every condition."""
     if x.shape[0] > 1:
         return jax.vmap(function)(x, pieces)
     one = function(*jtu.tree_map(lambda leaf: leaf[0], (x, pieces)))
@@ -102,7 +101,7 @@ def _each(function: Callable, x: Any, pieces: Piece) -> Any:
 
 
 def gaps(objective: Objective, predicted: Prediction) -> Float[Array, "joints d"]:
-    """The gaps from the end of a piece to the start of the next, along the manifold there."""
+    """Return the gaps from the end of a piece to the start of the next, along the manifold there."""
     j = objective.joints
     jump = predicted.end[j] - predicted.begin[j + 1]
     gap = jnp.sum(objective.pieces.basis[j + 1] * jump[:, :, None], axis=1)
@@ -111,14 +110,14 @@ def gaps(objective: Objective, predicted: Prediction) -> Float[Array, "joints d"
 
 
 def weighted(objective: Objective, predicted: Prediction) -> Float[Array, "pieces L k"]:
-    """Residuals in units of `sigma`."""
+    """Return the residuals in units of `sigma`."""
     pieces = objective.pieces
     r = pieces.weights * (predicted.observed - pieces.data)
     penalty = jnp.where(pieces.weights > 0, objective.penalty, 0)
     return jnp.where(predicted.failed[:, None, None] > 0, penalty, r)
 
 
-class Linearized(NamedTuple):
+class LinearizedResiduals(NamedTuple):
     """Weighted residuals, the gaps, and their derivatives; the slopes `d theta / d u`."""
 
     r: Float[Array, "pieces L k"]
@@ -129,7 +128,7 @@ class Linearized(NamedTuple):
 
 
 @eqx.filter_jit
-def linearize(u: Unknowns, solved: Solved, objective: Objective) -> Linearized:
+def linearize(u: Unknowns, solved: Solved, objective: Objective) -> LinearizedResiduals:
     def both(u: Any) -> Any:
         predicted = solved.around(u, objective)
         out = weighted(objective, predicted), gaps(objective, predicted)
@@ -137,11 +136,11 @@ def linearize(u: Unknowns, solved: Solved, objective: Objective) -> Linearized:
 
     (J, C), (r, c) = jax.jacfwd(both, has_aux=True)(u)
     slopes = jax.jvp(objective.transform.values, (u,), (jnp.ones_like(u),))[1]
-    return Linearized(r, J, c, C, slopes)
+    return LinearizedResiduals(r, J, c, C, slopes)
 
 
 def stacked(u: Any, solved: Solved, objective: Objective) -> tuple[np.ndarray, np.ndarray]:
-    """The Jacobian `(n, N)` and the residuals `(n,)`, both of the data and of the joints."""
+    """Return the Jacobian `(n, N)` and the residuals `(n,)`, both of the data and of the joints."""
     linear = jtu.tree_map(np.asarray, linearize(u, solved, objective))
     weight, N = np.asarray(objective.stiffness), u.size
     J = np.concatenate([linear.J.reshape(-1, N), weight * linear.C.reshape(-1, N)])
@@ -150,8 +149,7 @@ def stacked(u: Any, solved: Solved, objective: Objective) -> tuple[np.ndarray, n
 
 
 def residuals(u: Unknowns, objective: Objective) -> tuple[Any, Any]:
-    """Return the residuals for least-squares solvers: of the data and of the joints; then the loss
-    and all pieces."""
+    """Return the residuals of data and joints for least-squares solvers; then the loss and all pieces."""
     solved = solve(u, objective)
     predicted = solved.around(u, objective)
     r = weighted(objective, predicted)
@@ -160,8 +158,8 @@ def residuals(u: Unknowns, objective: Objective) -> tuple[Any, Any]:
 
 
 def total_loss(u: Unknowns, objective: Objective, batch: Any = None) -> tuple[FloatScalar, Any]:
-    """Return the loss for minimizers: the sum over all records, or the mean over those of a batch;
-    then as above."""
+    """Return the loss for minimizers: the sum over records, or the mean over a batch; then as
+    `residuals`."""
     x, pieces = objective.chosen(u, batch)
     if objective.reverse:
         one = lambda x, piece: _backwards(x, (piece, objective.simulator))
@@ -194,7 +192,7 @@ def _own_loss(objective: Objective, observed: Any, data: Any, weights: Any) -> F
 
 @eqx.filter_custom_vjp
 def _backwards(x: Any, rest: Any) -> Prediction:
-    """Differentiate for many unknowns: one sweep backwards instead of one forwards for each."""
+    """Differentiate with respect to many unknowns: one reverse sweep instead of many forward sweeps."""
     piece, simulator = rest
     return simulator.predict(x, piece, StepReplayAdjoint())
 
@@ -209,7 +207,7 @@ def _backwards_fwd(perturbed: Any, x: Any, rest: Any) -> Any:
 
 @_backwards.def_bwd
 def _backwards_bwd(kept: Any, cotangent: Any, perturbed: Any, x: Any, rest: Any) -> Any:
-    """The zero cotangent of a failed solve would turn into NaN."""
+    """Replace a zero cotangent, which a failed solve would turn into NaN."""
     del perturbed, x, rest
     pullback, out = kept
     given = zip(out, cotangent, strict=True)

@@ -1,4 +1,4 @@
-"""The loops around optimizers: history, early stop, parameters at bounds."""
+"""The loops around optimizers: history, early stopping, parameters at bounds."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -13,11 +13,11 @@ import optimistix as optx
 from .bounds import BESIDE, driven, linear_step, on_bounds, put_beside_bounds, put_on_bounds
 from .convergence import at_minimum, flat, stalled
 from .objective import gaps, Objective, residuals, Solved, total_loss
-from .progress import Meter
+from .progress import FitMeter
 
 
 class Options(NamedTuple):
-    """By what, how long and how often to optimize, in which order, and where to say how far it is."""
+    """The optimizer, its limits, the order of records, and the progress meter."""
 
     optimizer: Any
     steps: int
@@ -25,15 +25,15 @@ class Options(NamedTuple):
     batch_size: int | None
     seed: int
     starts: int
-    meter: Meter
+    meter: FitMeter
 
     @property
     def by_gradient(self) -> bool:
         return isinstance(self.optimizer, optax.GradientTransformation)
 
 
-class Outcome(NamedTuple):
-    """The unknowns, all pieces and the loss there, the loss of each step, and how it ended."""
+class OptimizerOutcome(NamedTuple):
+    """The final unknowns, all pieces and the loss there, the loss of each step, and the message."""
 
     u: Any
     solved: Solved
@@ -44,8 +44,8 @@ class Outcome(NamedTuple):
 
 
 def look(u: Any, objective: Objective, options: Options) -> tuple[Any, Solved]:
-    """The loss and all pieces at one point, by the program that takes steps if it can tell:
-    compiling takes longer than solving."""
+    """Return the loss and all pieces at one point, by the program that takes steps if that returns
+    them: compiling takes longer than solving."""
     if options.by_gradient:
         return _loss(u, objective)[1]
     state = _initialize(options.optimizer, u, objective)
@@ -55,7 +55,7 @@ def look(u: Any, objective: Objective, options: Options) -> tuple[Any, Solved]:
 _loss = eqx.filter_jit(total_loss)
 
 
-def optimize(objective: Objective, u: Any, options: Options) -> Outcome:
+def optimize(objective: Objective, u: Any, options: Options) -> OptimizerOutcome:
     if options.by_gradient:
         return _with_optax(objective, u, options)
     if objective.joints.size == 0:
@@ -63,9 +63,9 @@ def optimize(objective: Objective, u: Any, options: Options) -> Outcome:
     return _closing_gaps(objective, u, options)
 
 
-def _within_bounds(objective: Objective, u: Any, options: Options) -> Outcome:
-    """Each parameter is put on a bound at most once, and at most once taken off again, if it belongs
-    inside after the others have moved."""
+def _within_bounds(objective: Objective, u: Any, options: Options) -> OptimizerOutcome:
+    """Optimize with bounds. Each parameter is put on a bound at most once, and at most once taken off
+    again, if it belongs inside after the others have moved."""
     transform = objective.transform
     losses, movable = [], np.ones(transform.start.size, bool)
     returning = movable.copy()
@@ -83,7 +83,7 @@ def _within_bounds(objective: Objective, u: Any, options: Options) -> Outcome:
             return found
         beside = put_beside_bounds(found.u, side, BESIDE, transform)
         step = linear_step(beside, look(beside, objective, options)[1], objective)
-        # of the distances now, those at which the linearized problem is solved
+        # of the current distances, those at which the linearized problem is solved
         left = 1 - side * step[: side.size]
         inside = (side != 0) & (left > 2) & returning
         if not np.any(inside):
@@ -95,9 +95,9 @@ def _within_bounds(objective: Objective, u: Any, options: Options) -> Outcome:
 
 def _with_optimistix(
     objective: Objective, u: Any, options: Options, losses: list[float], movable: np.ndarray
-) -> Outcome:
-    """Step by step through the public methods of the solver, which return what was seen at the
-    point from which they step. Ends early where a `movable` parameter is driven to a bound."""
+) -> OptimizerOutcome:
+    """Optimize step by step through the public methods of the solver, which return the values at the
+    point from which they step. End early if a `movable` parameter is driven to a bound."""
     solver, done, okay, message = options.optimizer, False, True, None
     state = _initialize(solver, u, objective)
     while message is None:
@@ -116,7 +116,7 @@ def _with_optimistix(
             message = "converged"
         else:
             u, done, okay = new, bool(new_done), bool(new_okay)
-    return Outcome(u, solved, losses, losses[-1], message == "converged", message)
+    return OptimizerOutcome(u, solved, losses, losses[-1], message == "converged", message)
 
 
 def _function_for(solver: Any) -> Callable:
@@ -139,11 +139,11 @@ def _advance(solver: Any, u: Any, objective: Objective, state: Any) -> Any:
     return u, state, seen, done, result == optx.RESULTS.successful
 
 
-def _closing_gaps(objective: Objective, u: Any, options: Options) -> Outcome:
-    """Multiple shooting: the states at the joints meet in the limit.
+def _closing_gaps(objective: Objective, u: Any, options: Options) -> OptimizerOutcome:
+    """Multiple shooting: close the gaps at the joints, which vanish in the limit.
 
-    An augmented Lagrangian, `sum r^2 + w^2 sum (c + s)^2`: after each fit `s` grows by the gaps
-    that are left, and `w` by ten. Source: Nocedal & Wright, Numerical Optimization, ch. 17.
+    An augmented Lagrangian, `sum r^2 + w^2 sum (c + s)^2`: after each fit `s` grows by the gaps that
+    are left, and `w` by ten. Source: Nocedal & Wright, Numerical Optimization, ch. 17.
     """
     losses = []
     for _ in range(12):
@@ -159,12 +159,12 @@ def _closing_gaps(objective: Objective, u: Any, options: Options) -> Outcome:
             ((objective.shift + gap) / 100, objective.stiffness * 10),
         )
     message = f"gaps of {size:.1e} are left between segments; take shorter ones"
-    # Next to others, it is the loss of no trajectory.
+    # Not comparable with other starts: it is the loss of no trajectory.
     return found._replace(losses=losses, loss=np.inf, success=False, message=message)
 
 
-def _with_optax(objective: Objective, u: Any, options: Options) -> Outcome:
-    """Epochs of one batch each, or of a random order of all records cut into batches."""
+def _with_optax(objective: Objective, u: Any, options: Options) -> OptimizerOutcome:
+    """Take epochs of one batch each, or of a random order of all records cut into batches."""
     records, size = objective.pieces.start.size, options.batch_size
     random = np.random.default_rng(options.seed)
     optimizer = optax.with_extra_args_support(options.optimizer)
@@ -187,7 +187,7 @@ def _with_optax(objective: Objective, u: Any, options: Options) -> Outcome:
             message = "the loss decreases no more"
             break
     solved = look(best[1], objective, options)[1]
-    return Outcome(best[1], solved, losses, best[0], True, message)
+    return OptimizerOutcome(best[1], solved, losses, best[0], True, message)
 
 
 @eqx.filter_jit

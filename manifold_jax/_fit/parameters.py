@@ -1,4 +1,4 @@
-"""Parameters with bounds as unknowns without: `u = 0` at the start, of relative size."""
+"""Parameters with bounds as functions of unbounded unknowns: `u = 0` at the start, of relative size."""
 
 from typing import Any
 
@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 
-# exp(50) is 5e21 times the start: beyond it only overflow is left.
+# exp(50) is 5e21 times the start: beyond it there is only overflow.
 LARGEST = 50.0
 
 
@@ -31,7 +31,7 @@ class Transform(eqx.Module):
     unravel: Any = eqx.field(static=True)
 
     def values(self, u: Float[Array, " N"]) -> Float[Array, " p"]:
-        """`theta` of the first `p` of all unknowns of a fit."""
+        """Return `theta` from the first `p` of all unknowns of a fit."""
         u = u[: self.start.size]
         s, has_a, has_b = self.start, jnp.isfinite(self.lower), jnp.isfinite(self.upper)
         # Selected twice, as the derivative of a discarded infinity would be NaN.
@@ -101,7 +101,7 @@ def _flat_prefix(prefix: Any, tree: Any, name: str, what: str) -> np.ndarray:
 
 
 def spread(prefix: Any, tree: Any, advice: str) -> Any:
-    """Numbers like those in `tree`, from a tree whose leaves hold for whole parts of it."""
+    """Return numbers like those in `tree`, from a tree whose leaves hold for whole parts of it."""
     fill = lambda value, part: jtu.tree_map(
         lambda leaf: np.broadcast_to(np.asarray(value, float), np.shape(leaf)), part
     )

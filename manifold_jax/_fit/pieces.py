@@ -20,9 +20,9 @@ from .model import at_start, Piece, Simulator
 def make_pieces(
     records: Records, segments: int, simulator: Simulator, states: Any, free_start: bool
 ) -> Piece:
-    """Pieces of all records, those of one record next to each other.
+    """Cut all records into pieces, those of one record next to each other.
 
-    A piece ends where the next one begins; what was measured there belongs to the next.
+    A piece ends where the next one begins; the measurement at that time belongs to the next.
     """
     R, T = records.ts.shape
     if not isinstance(segments, int) or not 1 <= segments < T:
@@ -49,12 +49,12 @@ def make_pieces(
 
 
 def edges_of(times: int, segments: int) -> np.ndarray:
-    """Indices of the times where pieces begin and end, `(segments + 1,)`."""
+    """Return the indices of the times where pieces begin and end, shape `(segments + 1,)`."""
     return np.round(np.linspace(0, times - 1, segments + 1)).astype(int)
 
 
 def _guess(records: Records, edges: np.ndarray, simulator: Simulator, states: Any) -> np.ndarray:
-    """States at the starts of all pieces, `(R, S, n)`: given, measured, or simulated."""
+    """Return states at the starts of all pieces, `(R, S, n)`: given, measured, or simulated."""
     one = lambda r: jfu.ravel_pytree(simulator.given(r).y0)[0]
     first = jax.vmap(one)(jnp.arange(records.ts.shape[0]))[:, None]
     if edges.size == 2:
@@ -72,7 +72,7 @@ def _guess(records: Records, edges: np.ndarray, simulator: Simulator, states: An
 
 
 def _simulate(records: Records, simulator: Simulator, y0: Any) -> np.ndarray:
-    """Trajectories with the start values of the parameters, for want of a better guess."""
+    """Simulate trajectories with the start values of the parameters, for lack of a better guess."""
     whole = dataclasses.replace(simulator, observe=None)
     (R, T), n = records.ts.shape, y0.shape[1]
     empty, first = jnp.zeros((R, T, 0)), jnp.ones(R, bool)
@@ -89,10 +89,10 @@ def _simulate(records: Records, simulator: Simulator, y0: Any) -> np.ndarray:
 
 
 def _charts(simulator: Simulator, start: np.ndarray, guess: np.ndarray, needed: bool) -> np.ndarray:
-    """Orthonormal bases of the tangent spaces at all guesses, `(R, S, n, d)`.
+    """Return orthonormal bases of the tangent spaces at all guesses, `(R, S, n, d)`.
 
-    `d` is the dimension of the manifold, of the whole space for conserved quantities, whose
-    values belong to the initial state. Without unknown states `d = 0`.
+    `d` is the dimension of the manifold, of the whole space for conserved quantities, whose values
+    belong to the initial state. `d = 0` if no states are unknown.
     """
     R, S, n = guess.shape
     setting = simulator.given()

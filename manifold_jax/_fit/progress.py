@@ -1,4 +1,4 @@
-"""What a fit is doing: a bar on a terminal, lines in a file, a pipe or a notebook."""
+"""Progress of a fit: a bar on a terminal, lines in a file, a pipe or a notebook."""
 
 import time
 from collections.abc import Iterator
@@ -7,10 +7,10 @@ from contextlib import contextmanager
 from .._base.extras import NoBar, print_line, terminal_bar
 
 
-class Meter:
-    """Silent unless `shown`.
+class FitMeter:
+    """A progress meter, silent unless `shown`.
 
-    Lines of steps are at least a second apart, and a tenth of the time gone by.
+    Lines of steps are at least a second and a tenth of the elapsed time apart.
     """
 
     def __init__(self, shown: bool):
@@ -21,7 +21,7 @@ class Meter:
         self.name, self.listed, self.count, self.steps = "fit", False, 0, 0
         self.begun = self.last = time.perf_counter()
 
-    def __enter__(self) -> "Meter":
+    def __enter__(self) -> "FitMeter":
         self.bar.start()
         return self
 
@@ -30,7 +30,7 @@ class Meter:
 
     @contextmanager
     def compiling(self, what: str) -> Iterator[None]:
-        """Report the time of the first use of a program; later ones are not worth a word."""
+        """Report the time of the first use of a program; later ones are not reported."""
         if what in self.known:
             yield
             return
@@ -43,7 +43,7 @@ class Meter:
         self.bar.update(self.task, description=self.name)
 
     def begin(self, name: str, steps: int, listed: bool = False) -> None:
-        """`listed`: whether its end stays on a terminal, too."""
+        """Begin a run of steps; `listed`: whether its end stays on a terminal, too."""
         self.name, self.steps, self.listed, self.count = name, steps, listed, 0
         self.bar.reset(self.task, total=steps, description=name, loss="")
 

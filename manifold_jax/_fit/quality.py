@@ -1,5 +1,4 @@
-"""How well the model fits the data, and how well they determine its parameters: standard errors from the
-Gauss-Newton matrix."""
+"""Quality of a fit: how well the model fits the data, and standard errors from the Gauss-Newton matrix."""
 
 from typing import Any, NamedTuple
 
@@ -12,14 +11,14 @@ from .data import Records
 from .objective import linearize, Objective, Solved, weighted
 
 
-# Derivatives are as accurate as the solver's tolerance; singular values below this fraction of
-# the largest, after columns are scaled to length 1, are not told from zero.
+# Derivatives are as accurate as the solver's tolerance: singular values below this fraction of the
+# largest, after scaling columns to length 1, count as zero.
 _SINGULAR = 1e-6
 
 
 class Quality(NamedTuple):
-    """What [`FitResult`][] says, likewise. `None` where it cannot be told: with a `loss` of one's own, or
-    without data to spare."""
+    """The fields of the same names in [`FitResult`][]; `None` where unknown: with a user's `loss`, or
+    if no data are left to estimate them."""
 
     covariance: np.ndarray | None
     noise: float | None
@@ -38,7 +37,7 @@ def judge(u: Any, solved: Solved, objective: Objective, records: Records) -> Qua
     failed = np.asarray(solved.values.failed) > 0
     used = (np.asarray(objective.pieces.weights) > 0) & ~failed[:, None, None]
     squares = float(np.sum(np.asarray(weighted(objective, solved.values))[used] ** 2))
-    # What is held at a bound is no unknown.
+    # A parameter held at a bound is not an unknown.
     free = np.concatenate([side == 0, np.ones(u.size - side.size, bool)])
     covariance, rank, lines = None, int(np.sum(free)), ()
     if solved.matrices is not None:
@@ -56,8 +55,8 @@ def judge(u: Any, solved: Solved, objective: Objective, records: Records) -> Qua
 def _determined(
     u: Any, solved: Solved, objective: Objective, used: np.ndarray, free: np.ndarray
 ) -> tuple[np.ndarray, int, tuple[str, ...]]:
-    """The covariance of the parameters for `sigma` as given, how many unknowns the data determine, and
-    the directions that they do not."""
+    """Return the covariance of the parameters for `sigma` as given, how many unknowns the data
+    determine, and the directions that they do not."""
     linear = jtu.tree_map(np.asarray, linearize(u, solved, objective))
     names, p = np.asarray(objective.transform.names), linear.slopes.size
     found = gauss_newton(linear.J[used][:, free], linear.C.reshape(-1, u.size)[:, free])
@@ -76,8 +75,8 @@ def _determined(
 
 
 class Uncertainty(NamedTuple):
-    """Covariance `(N, N)` for noise of size 1, of how many unknowns the data tell, and a basis of the
-    directions along which nothing changes, `(directions, N)`, each of few unknowns."""
+    """Covariance `(N, N)` for noise of size 1, the number of unknowns that the data determine, and a
+    basis of the directions that they do not, `(directions, N)`, each with few unknowns."""
 
     covariance: np.ndarray
     rank: int
@@ -85,7 +84,7 @@ class Uncertainty(NamedTuple):
 
 
 def gauss_newton(J: np.ndarray, C: np.ndarray) -> Uncertainty:
-    r"""Covariance of a linear least-squares fit, `(J^T J)^-1` on the null space of `C`.
+    r"""Return the covariance of a linear least-squares fit, `(J^T J)^-1` on the null space of `C`.
 
     `J` are the derivatives of the weighted residuals, `C` those of equations that hold exactly (the
     gaps of multiple shooting). With `Z` a basis of the null space of `C`, it is
@@ -98,7 +97,7 @@ def gauss_newton(J: np.ndarray, C: np.ndarray) -> Uncertainty:
     scale = 1 / np.where(dead, 1.0, size)
     J, C = np.where(dead, 0.0, J * scale), np.where(dead, 0.0, C * scale)
     Z = scipy.linalg.null_space(C, rcond=1e-12) if C.size else np.eye(J.shape[1])
-    # The triangle has the same singular values, and the size of the unknowns only.
+    # The triangular factor has the same singular values, and the size of the unknowns only.
     _, s, Vt = np.linalg.svd(np.linalg.qr(J @ Z, mode="r"), full_matrices=True)
     s = np.concatenate([s, np.zeros(Vt.shape[0] - s.size)])
     small = s <= _SINGULAR * np.max(s, initial=0.0)
@@ -108,7 +107,7 @@ def gauss_newton(J: np.ndarray, C: np.ndarray) -> Uncertainty:
 
 
 def _sparse(directions: np.ndarray) -> np.ndarray:
-    """Another basis, in which each vector has one unknown for itself: Gauss-Jordan elimination."""
+    """Return another basis, in which each vector has one unknown to itself (Gauss-Jordan elimination)."""
     count = directions.shape[0]
     if count == 0:
         return directions
@@ -119,15 +118,17 @@ def _sparse(directions: np.ndarray) -> np.ndarray:
 def describe(
     direction: np.ndarray, slopes: np.ndarray, names: np.ndarray
 ) -> tuple[str, np.ndarray]:
-    """A line for the report, and which of the `p` parameters are involved.
+    """Describe a direction in a line of the report; return also which of the `p` parameters are
+    involved.
 
-    Involved are those that change by a twentieth of the largest change; numbers are changes of the
-    parameters in their own units (`slopes`: by their unknowns), the largest of them 1."""
+    Those are involved that change by a twentieth of the largest change; numbers are changes of the
+    parameters in their own units (`slopes`: with respect to their unknowns), the largest of them 1.
+    """
     p, size = len(names), np.max(np.abs(direction))
     involved = np.abs(direction[:p]) > 0.05 * size
     change = direction[:p] * np.where(involved, slopes, 0.0)
     largest = change[np.argmax(np.abs(change))] if p else 0.0
-    # A fit that has diverged may be where unknowns change their parameters by nothing, or by infinity.
+    # After divergence, unknowns may change their parameters by nothing, or by infinity.
     told = largest != 0 and np.isfinite(largest)
     parts = [
         f"{names[i]} ({change[i] / largest:+.3g})" if told else str(names[i])

@@ -1,4 +1,4 @@
-"""The result of a fit: parameters, how well they fit and are determined, a text and a picture."""
+"""The result of a fit: parameters, their quality, a text and a picture."""
 
 import itertools
 from pathlib import Path
@@ -12,15 +12,15 @@ from scipy.special import chdtrc
 from .._base.extras import require
 
 
-# Truly wrong models are "rejected with vastly smaller values" (Press et al., Numerical Recipes, 15.1).
+# Wrong models are "rejected with vastly smaller values" (Press et al., Numerical Recipes, 15.1).
 _LEAST_PROBABILITY = 1e-3
 # Columns of the table of starts.
 _MOST_NAMES = 6
 
 
 class Start(NamedTuple):
-    """Where one of several starts of [`fit`][] was, and how it ended: `start` and `parameters` in the
-    structure of the parameters, the final loss, the number of steps, and as for [`FitResult`][]."""
+    """One of several starts of [`fit`][] and its end: `start` and `parameters` in the structure of the
+    parameters, the final loss, the number of steps, and `success` and `message` as in [`FitResult`][]."""
 
     start: Any
     parameters: Any
@@ -31,7 +31,7 @@ class Start(NamedTuple):
 
 
 class FitResult(eqx.Module):
-    """What [`fit`][] found. Arrays are NumPy's; `print(result)` is a report.
+    """The result of [`fit`][]. Arrays are NumPy's; `print(result)` is a report.
 
     - `parameters`: the estimates, in the structure of the start values.
     - `standard_errors`: likewise; infinite where the data do not determine a parameter, NaN for one at
@@ -108,7 +108,7 @@ class FitResult(eqx.Module):
         return "\n".join(lines + (self._table() if len(self.starts) > 1 else []))
 
     def _verdict(self) -> list[str]:
-        """Return the verdict of the optimizer, and if `sigma` is known of the model."""
+        """Return the verdict of the optimizer, and on the model if `sigma` is known."""
         state = "fitted" if self.success else "NOT FITTED"
         ended = f"{self.message} ({len(self.history)} steps)"
         if self.fits is not False:
@@ -159,7 +159,7 @@ class FitResult(eqx.Module):
         The Matplotlib figure.
         """
         require("matplotlib", "cli", "`plot`")
-        from matplotlib.figure import Figure  # a second that only pictures need
+        from matplotlib.figure import Figure  # takes a second to import, needed for pictures only
 
         figure = Figure(figsize=(12, 4), layout="constrained")
         left, middle, right = figure.subplots(1, 3)
@@ -176,7 +176,7 @@ class FitResult(eqx.Module):
         return figure
 
     def _curves(self) -> Any:
-        """Up to eight components over time, of the first record and then of others."""
+        """Return up to eight components over time, of the first record and then of others."""
         ts = np.atleast_2d(self.ts)
         flat = lambda tree: np.concatenate(
             [np.reshape(leaf, (*ts.shape, -1)) for leaf in jtu.tree_leaves(tree)], axis=2

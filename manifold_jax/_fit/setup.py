@@ -1,4 +1,4 @@
-"""The start of a fit: options checked, everything put together and scaled."""
+"""The start of a fit: checks of options, and the objective with its scales."""
 
 from typing import Any
 
@@ -16,7 +16,7 @@ from .objective import Objective
 from .optimize import Options
 
 
-# Unknowns of one trajectory beyond which one reverse sweep is cheaper than a forward sweep for each.
+# Number of unknowns of a trajectory beyond which one reverse sweep is cheaper than forward sweeps.
 _MANY_UNKNOWNS = 50
 
 

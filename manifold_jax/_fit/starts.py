@@ -1,4 +1,4 @@
-"""Several starts: where they are, and which of them ends best."""
+"""Several starts of a fit: their choice, and the best result."""
 
 from typing import Any, NamedTuple
 
@@ -8,22 +8,22 @@ import jax.tree_util as jtu
 import numpy as np
 
 from .objective import Objective, weighted
-from .optimize import look, optimize, Options, Outcome
+from .optimize import look, optimize, OptimizerOutcome, Options
 from .parameters import Transform
 from .report import Start
 from .setup import refuse_tracers
 
 
-# Other starts of a parameter with one bound are up to so many times nearer to it or farther away.
+# Other starts of a parameter with one bound are up to this factor nearer to it or farther away.
 _FACTOR = 3.0
-# Of so many points for each other start, those with the lowest losses are taken.
+# Number of points for each other start, of which those with the lowest losses are taken.
 _POINTS = 8
 # Losses that differ by less belong to one optimum.
 _SAME = 1e-6
 
 
 class Seen(NamedTuple):
-    """What there is at one point: the loss, which solves fail, and the largest residual of the others."""
+    """The loss at one point, the solves that fail there, and the largest residual of the others."""
 
     loss: float
     failed: np.ndarray
@@ -31,12 +31,12 @@ class Seen(NamedTuple):
 
 
 def draw_points(transform: Transform, starts: int, seed: int) -> np.ndarray:
-    """Unknowns `(points, p)`: the given start, and a Latin hypercube around it."""
+    """Draw unknowns `(points, p)`: the given start, and a Latin hypercube around it."""
     s, a, b = (np.asarray(x) for x in (transform.start, transform.lower, transform.upper))
     given = np.zeros((1, s.size))
     if starts == 1:
         return given
-    from scipy.stats import qmc  # half a second that only several starts need
+    from scipy.stats import qmc  # takes half a second to import, needed for several starts only
 
     cube = qmc.LatinHypercube(s.size, rng=np.random.default_rng(seed)).random(
         _POINTS * (starts - 1)
@@ -60,8 +60,8 @@ def see(u: Any, objective: Objective, options: Options) -> Seen:
 def choose(
     points: list[Any], given: Seen, objective: Objective, options: Options
 ) -> tuple[list[Any], list[Seen]]:
-    """The given start, the first of `points`, and of the others those with the fewest failures, then
-    with the lowest losses."""
+    """Choose the given start, the first of `points`, and of the others those with the fewest failures,
+    then with the lowest losses."""
     seen = [given]
     if options.starts > 1:
         options.meter.begin("fit: looking for starts", len(points) - 1)
@@ -75,7 +75,7 @@ def choose(
 
 
 def with_scales(objective: Objective, seen: list[Seen]) -> Objective:
-    """A failed solve counts ten times the largest residual at all starts."""
+    """Set the penalty: a failed solve counts ten times the largest residual at all starts."""
     if np.all([at.failed for at in seen]):
         raise ValueError(
             "`parameters`: every solve from the start values fails (or its derivatives are not "
@@ -90,9 +90,9 @@ def with_scales(objective: Objective, seen: list[Seen]) -> Objective:
 
 def optimize_all(
     objective: Objective, points: list[Any], seen: list[Seen], options: Options
-) -> tuple[Outcome, tuple[Start, ...]]:
-    """One after the other by the same compiled program, as compiling takes longer than a few fits.
-    The best, and a table of all with the best first."""
+) -> tuple[OptimizerOutcome, tuple[Start, ...]]:
+    """Optimize one start after the other with the same compiled program, as compiling takes longer than
+    a few fits. Return the best, and a table of all with the best first."""
     best, rows, several = None, [], len(points) > 1
     like = lambda u: jtu.tree_map(np.asarray, objective.transform.parameters(u))
     for number, (u, at) in enumerate(zip(points, seen, strict=True), 1):
@@ -111,9 +111,8 @@ def optimize_all(
     return best, (chosen, *others)  # pyright: ignore[reportReturnType]
 
 
-def _better(new: Outcome, old: Outcome) -> bool:
-    """Return whether the new one is better; of the same optimum, prefer one where the optimizer
-    converged."""
+def _better(new: OptimizerOutcome, old: OptimizerOutcome) -> bool:
+    """Whether the new result is better; of the same optimum, the one where the optimizer converged."""
     if abs(new.loss - old.loss) <= _SAME * abs(old.loss) and new.success != old.success:
         return new.success
     return new.loss < old.loss

@@ -1,4 +1,4 @@
-"""The end of a fit: what was found, at the times of the data."""
+"""The end of a fit: its result, at the times of the data."""
 
 import itertools
 from typing import Any
@@ -12,14 +12,14 @@ import numpy as np
 from .._constraint.project import consistent_state
 from .data import Records, unflatten
 from .objective import Objective
-from .optimize import Outcome
+from .optimize import OptimizerOutcome
 from .pieces import edges_of
 from .quality import judge
 from .report import FitResult, Start
 
 
 def summarize(
-    objective: Objective, outcome: Outcome, starts: tuple[Start, ...], records: Records
+    objective: Objective, outcome: OptimizerOutcome, starts: tuple[Start, ...], records: Records
 ) -> FitResult:
     u, transform = outcome.u, objective.transform
     observed, *_, failed = jtu.tree_map(np.asarray, outcome.solved.values)
@@ -53,7 +53,7 @@ def summarize(
 
 @eqx.filter_jit
 def _initial_states(u: Any, objective: Objective) -> Any:
-    """The states at the starts of all pieces, on the manifold."""
+    """Return the states at the starts of all pieces, on the manifold."""
     x, pieces = objective.chosen(u)
 
     def one(x: Any, piece: Any) -> Any:
@@ -65,7 +65,7 @@ def _initial_states(u: Any, objective: Objective) -> Any:
 
 
 def _on_grid(observed: np.ndarray, records: Records) -> np.ndarray:
-    """Predictions of the pieces back at the times of their records, `(R, T, k)`."""
+    """Return the predictions of the pieces at the times of their records, `(R, T, k)`."""
     R, T, k = records.data.shape
     observed = observed.reshape(R, -1, *observed.shape[1:])
     edges = edges_of(T, observed.shape[1])

@@ -1,1 +1,1 @@
-"""What traced functions tell: which outputs depend on which inputs, and programs that run in lanes."""
+"""Analysis of traced functions: which outputs depend on which inputs, and evaluation in lanes."""

@@ -1,9 +1,8 @@
-"""Which numbers that a function returns depend on which of the numbers it is given.
+"""Sparsity pattern of the Jacobian of a traced function, without computing derivatives.
 
-The traced function is walked through once with sets of inputs in the place of numbers. What depends
-on a number is never missed: a primitive without a rule makes all it returns depend on all it gets.
-Also what is piecewise constant counts, as comparisons and `sign`: their value matters even where
-their derivative is zero.
+The traced function is evaluated once with sets of inputs in the place of numbers. No dependence is
+missed: all results of a primitive without a rule depend on all of its operands. Piecewise constant
+functions such as comparisons and `sign` count as dependent, although their derivative is zero.
 """
 
 import functools
@@ -16,35 +15,34 @@ import jax.core
 import numpy as np
 
 from .._base.compat import scan_counts
-from .incidence_rules import known_value, RULES, union, Value
+from .incidence_rules import Dependence, flagged, known_value, RULES, union
 from .trace import called, unrolled_scan, walk
 
 
-# Iterations of a scan that are walked through one by one, so that counters are known.
+# Largest number of iterations of a scan that are evaluated one by one, so that counters are known.
 _MOST_ITERATIONS = 1000
 
 
 class Incidence(NamedTuple):
-    """`depends[i, j]`: the number `i` that is returned depends on the input `j`. And the primitives
-    without a rule of their own, with how often they were met."""
+    """The dependence of the results of a function on its inputs."""
 
-    depends: np.ndarray
-    unknown_primitives: dict[str, int]
+    depends: np.ndarray  # [i, j]: the number `i` that is returned depends on the input `j`
+    unknown_primitives: dict[str, int]  # without a rule, with how often they were met
 
 
 def incidence(function: Callable, *tracked: tuple[Any, np.ndarray]) -> Incidence:
-    """Return the incidence of `function(*arguments)`, which returns one vector. For each argument,
-    a pytree of arrays, the inputs as which its numbers count: a bool array of shape `(numbers,
-    inputs)`."""
+    """Return the incidence of `function(*arguments)`, which returns one vector. `tracked` are pairs of
+    an argument, a pytree of arrays, and of the inputs as which its numbers count: a bool array of
+    shape `(numbers, inputs)`."""
     arguments = [argument for argument, _ in tracked]
     closed = jax.make_jaxpr(function)(*arguments)
     inputs = np.concatenate([inputs for _, inputs in tracked])
     values, number, start = [], inputs.shape[1], 0
-    # All may be other than zero.
+    # With the flag of [`Dependence`][]: all of them may be other than zero.
     inputs = np.append(inputs, np.ones((len(inputs), 1), bool), axis=1)
     for leaf in jax.tree_util.tree_leaves(arguments):
         end = start + np.size(leaf)
-        values.append(Value(inputs[start:end].reshape(*np.shape(leaf), number + 1)))
+        values.append(Dependence(inputs[start:end].reshape(*np.shape(leaf), number + 1)))
         start = end
     search = Search(number, Counter())
     (out,) = search.through(closed, values)
@@ -52,32 +50,30 @@ def incidence(function: Callable, *tracked: tuple[Any, np.ndarray]) -> Incidence
 
 
 class Search(NamedTuple):
-    """What depends on what, in the order of execution of a traced function."""
+    """Evaluates a traced function with a [`Dependence`][] for every array."""
 
     number: int  # of inputs
     unknown: Counter
 
-    def through(self, function: Any, inputs: Sequence[Value]) -> list[Value]:
+    def through(self, function: Any, inputs: Sequence[Dependence]) -> list[Dependence]:
         return walk(function, inputs, self._known, self._equation)
 
-    def _known(self, constant: Any) -> Value:
+    def _known(self, constant: Any) -> Dependence:
         try:
             if not isinstance(constant, jax.core.Tracer):
-                return Value.constant(np.asarray(constant), self.number)
-        except (TypeError, ValueError):  # random keys, for instance
+                return Dependence.constant(np.asarray(constant), self.number)
+        except (TypeError, ValueError):  # e.g. random keys
             pass
-        depends = np.zeros((*np.shape(constant), self.number + 1), bool)
-        depends[..., -1] = True
-        return Value(depends)
+        return Dependence(flagged(np.zeros((*np.shape(constant), self.number + 1), bool), True))
 
-    def _equation(self, equation: Any, values: list[Value]) -> list[Value]:
+    def _equation(self, equation: Any, values: list[Dependence]) -> list[Dependence]:
         name = equation.primitive.name
         inner = called(equation) if name not in _CONTROL else None
         if inner is not None and not name.startswith("custom_vjp"):
             return self.through(inner, values)
         constant = all(value.is_constant for value in values)
         if constant and (known := known_value(equation, values)) is not None:
-            return [Value.constant(value, self.number) for value in known]
+            return [Dependence.constant(value, self.number) for value in known]
         if name.startswith("custom_vjp") and not constant:
             raise TypeError(
                 "The equations use a function with `jax.custom_vjp`, which cannot be differentiated forwards, as "
@@ -89,26 +85,27 @@ class Search(NamedTuple):
             equation, values
         )
 
-    def _any(self, equation: Any, values: list[Value]) -> list[Value]:
-        """All that is returned depends on all that is given."""
-        everything = np.append(union(values)[:-1] if values else np.zeros(self.number, bool), True)
+    def _any(self, equation: Any, values: list[Dependence]) -> list[Dependence]:
+        """Let all that is returned depend on all that is given."""
+        everything = union(values) if values else np.zeros(self.number + 1, bool)
+        everything = flagged(everything, True)
         self.unknown[equation.primitive.name] += int(everything[:-1].any())
         shapes = [(*out.aval.shape, self.number + 1) for out in equation.outvars]
-        return [Value(np.broadcast_to(everything, shape)) for shape in shapes]
+        return [Dependence(np.broadcast_to(everything, shape)) for shape in shapes]
 
 
-def _either(*alternatives: list[Value]) -> list[Value]:
+def _either(*alternatives: list[Dependence]) -> list[Dependence]:
     return [
-        Value(functools.reduce(np.logical_or, [value.depends for value in values]))
+        Dependence(functools.reduce(np.logical_or, [value.depends for value in values]))
         for values in zip(*alternatives, strict=True)
     ]
 
 
-def _also(values: list[Value], condition: np.ndarray) -> list[Value]:
-    return [Value(value.depends | condition) for value in values]
+def _also(values: list[Dependence], condition: np.ndarray) -> list[Dependence]:
+    return [Dependence(value.depends | condition) for value in values]
 
 
-def _cond(search: Search, equation: Any, values: list[Value]) -> list[Value]:
+def _cond(search: Search, equation: Any, values: list[Dependence]) -> list[Dependence]:
     index, *operands = values
     branches = equation.params["branches"]
     if index.known is not None:
@@ -116,12 +113,14 @@ def _cond(search: Search, equation: Any, values: list[Value]) -> list[Value]:
     return _also(_either(*(search.through(b, operands) for b in branches)), union([index]))
 
 
-def _while(search: Search, equation: Any, values: list[Value]) -> list[Value]:
+def _while(search: Search, equation: Any, values: list[Dependence]) -> list[Dependence]:
     n, m = equation.params["cond_nconsts"], equation.params["body_nconsts"]
     of_condition, of_body = values[:n], values[n : n + m]
-    carry = [Value(value.depends) for value in values[n + m :]]  # known numbers are those before
+    carry = [
+        Dependence(value.depends) for value in values[n + m :]
+    ]  # without the values before the loop
 
-    def once(carry: list[Value]) -> list[Value]:
+    def once(carry: list[Dependence]) -> list[Dependence]:
         (condition,) = search.through(equation.params["cond_jaxpr"], of_condition + carry)
         after = search.through(equation.params["body_jaxpr"], of_body + carry)
         return _also(_either(carry, after), union([condition]))
@@ -129,7 +128,7 @@ def _while(search: Search, equation: Any, values: list[Value]) -> list[Value]:
     return _until_unchanged(once, carry)
 
 
-def _until_unchanged(once: Callable, carry: list[Value]) -> list[Value]:
+def _until_unchanged(once: Callable, carry: list[Dependence]) -> list[Dependence]:
     while True:
         after = once(carry)
         if all((a.depends == b.depends).all() for a, b in zip(after, carry, strict=True)):
@@ -137,23 +136,23 @@ def _until_unchanged(once: Callable, carry: list[Value]) -> list[Value]:
         carry = after
 
 
-def _scan(search: Search, equation: Any, values: list[Value]) -> list[Value]:
+def _scan(search: Search, equation: Any, values: list[Dependence]) -> list[Dependence]:
     if not 0 < equation.params["length"] <= _MOST_ITERATIONS:
         return _long_scan(search, equation, values)
-    item = lambda x, i: Value(x.depends[i], None if x.known is None else x.known[i])
-    stack = lambda rows, aval: Value(np.stack([row.depends for row in rows]))
+    item = lambda x, i: Dependence(x.depends[i], None if x.known is None else x.known[i])
+    stack = lambda rows, aval: Dependence(np.stack([row.depends for row in rows]))
     return unrolled_scan(equation, values, search.through, item, stack)
 
 
-def _long_scan(search: Search, equation: Any, values: list[Value]) -> list[Value]:
-    """All iterations alike."""
+def _long_scan(search: Search, equation: Any, values: list[Dependence]) -> list[Dependence]:
+    """Treat all iterations alike."""
     n, m = scan_counts(equation)
-    items = [Value(x.depends.any(axis=0)) for x in values[n + m :]]  # pyright: ignore[reportArgumentType]
+    items = [Dependence(x.depends.any(axis=0)) for x in values[n + m :]]  # pyright: ignore[reportArgumentType]
     through = lambda carry: search.through(equation.params["jaxpr"], values[:n] + carry + items)
-    carry = [Value(value.depends) for value in values[n : n + m]]
+    carry = [Dependence(value.depends) for value in values[n : n + m]]
     carry = _until_unchanged(lambda c: _either(c, through(c)[:m]), carry)
     outputs = [
-        Value(np.broadcast_to(value.depends, (*out.aval.shape, search.number + 1)))
+        Dependence(np.broadcast_to(value.depends, (*out.aval.shape, search.number + 1)))
         for value, out in zip(through(carry)[m:], equation.outvars[m:], strict=True)
     ]
     return carry + outputs

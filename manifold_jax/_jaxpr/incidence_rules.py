@@ -1,4 +1,4 @@
-"""What the results of one primitive depend on, number by number."""
+"""Dependence of the results of one primitive on its operands, number by number."""
 
 import functools
 import math
@@ -13,31 +13,41 @@ from jax import lax
 from .primitives import arranged_factors, ELEMENTWISE, evaluated, MOVES, sources, VANISHING
 
 
-class Value(NamedTuple):
-    """What is known of an array of shape `S`: the inputs its numbers depend on, shape `(*S, inputs
-    + 1)`, and the numbers themselves if they are constants. Behind the inputs stands whether a
-    number may be other than zero: for sums and moves that follows the same rule."""
+class Dependence(NamedTuple):
+    """The dependence of an array of shape `S` on the inputs."""
 
-    depends: np.ndarray
-    known: np.ndarray | None = None
+    # On which inputs each number depends. The last column is a flag, whether the number may be other
+    # than zero: for sums and moves it follows the same rule.
+    depends: np.ndarray  # (*S, inputs + 1), bool
+    known: np.ndarray | None = None  # the numbers, if they are constants
 
     @staticmethod
-    def constant(known: np.ndarray, inputs: int) -> "Value":
-        depends = np.zeros((*known.shape, inputs + 1), bool)
-        depends[..., -1] = known != 0
-        return Value(depends, known)
+    def constant(known: np.ndarray, inputs: int) -> "Dependence":
+        return Dependence(flagged(np.zeros((*known.shape, inputs + 1), bool), known != 0), known)
 
     @property
     def is_constant(self) -> bool:
         return not self.depends[..., :-1].any()
 
 
+def flagged(depends: np.ndarray, nonzero: Any) -> np.ndarray:
+    """Return `depends` with another flag "may be other than zero", `nonzero`."""
+    depends = depends.copy()
+    depends[..., -1] = nonzero
+    return depends
+
+
+def may_be_nonzero(depends: np.ndarray) -> np.ndarray:
+    """Return the flag, shape `(*S, 1)`."""
+    return depends[..., -1:]
+
+
 # Larger constants are not folded: their zeros are not worth the time.
 _MOST_FOLDED = 1_000_000
 
 
-def known_value(equation: Any, values: list[Value]) -> list[np.ndarray] | None:
-    """What an equation makes of constants, if it is known."""
+def known_value(equation: Any, values: list[Dependence]) -> list[np.ndarray] | None:
+    """Return the results of an equation of constants, `None` if they cannot be computed."""
     size = sum(math.prod(out.aval.shape) for out in equation.outvars)
     if size > _MOST_FOLDED or any(value.known is None for value in values):
         return None
@@ -47,8 +57,8 @@ def known_value(equation: Any, values: list[Value]) -> list[np.ndarray] | None:
         return None
 
 
-def union(values: list[Value]) -> np.ndarray:
-    """All inputs that any of the numbers depends on."""
+def union(values: list[Dependence]) -> np.ndarray:
+    """Return all inputs on which any of the numbers depends, with the flag, shape `(inputs + 1,)`."""
     flat = [value.depends.reshape(-1, value.depends.shape[-1]).any(axis=0) for value in values]
     return functools.reduce(np.logical_or, flat)  # pyright: ignore[reportReturnType]
 
@@ -57,87 +67,80 @@ def _spread(depends: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     return np.broadcast_to(depends, (*shape, depends.shape[-1]))
 
 
-def _vanishing(equation: Any, values: list[Value]) -> list[Value]:
-    """Number by number, and zero of zeros."""
+def _vanishing(equation: Any, values: list[Dependence]) -> list[Dependence]:
+    """Elementwise functions whose value at zeros is zero."""
     shape = equation.outvars[0].aval.shape
     return [
-        Value(functools.reduce(np.logical_or, [_spread(value.depends, shape) for value in values]))
+        Dependence(functools.reduce(np.logical_or, [_spread(x.depends, shape) for x in values]))
     ]
 
 
-def _elementwise(equation: Any, values: list[Value]) -> list[Value]:
-    depends = _vanishing(equation, values)[0].depends.copy()
-    depends[..., -1] = True
-    return [Value(depends)]
+def _elementwise(equation: Any, values: list[Dependence]) -> list[Dependence]:
+    return [Dependence(flagged(_vanishing(equation, values)[0].depends, True))]
 
 
-def _multiply(equation: Any, values: list[Value]) -> list[Value]:
-    """Nothing depends on what is multiplied by zero."""
+def _multiply(equation: Any, values: list[Dependence]) -> list[Dependence]:
+    """A product with a zero is zero, and depends on nothing."""
     a, b = (_spread(value.depends, equation.outvars[0].aval.shape) for value in values)
-    return [Value((a | b) & a[..., -1:] & b[..., -1:])]
+    return [Dependence((a | b) & may_be_nonzero(a) & may_be_nonzero(b))]
 
 
-def _divide(equation: Any, values: list[Value]) -> list[Value]:
+def _divide(equation: Any, values: list[Dependence]) -> list[Dependence]:
     a, b = (_spread(value.depends, equation.outvars[0].aval.shape) for value in values)
-    return [Value((a | b) & a[..., -1:])]
+    return [Dependence((a | b) & may_be_nonzero(a))]
 
 
-def _power(equation: Any, values: list[Value]) -> list[Value]:
+def _power(equation: Any, values: list[Dependence]) -> list[Dependence]:
     keeps_zero = equation.params["y"] > 0
     return _vanishing(equation, values) if keeps_zero else _elementwise(equation, values)
 
 
-def _select(equation: Any, values: list[Value]) -> list[Value]:
+def _select(equation: Any, values: list[Dependence]) -> list[Dependence]:
     shape = equation.outvars[0].aval.shape
     which, *cases = values
     alternatives = [_spread(case.depends, shape) for case in cases]
     if which.known is not None:
         chosen = np.broadcast_to(which.known, shape).astype(int)[..., None]
-        return [Value(np.choose(chosen, alternatives))]
-    depends = functools.reduce(np.logical_or, alternatives)
-    return [
-        Value(
-            depends
-            | _spread(which.depends, shape) & (np.arange(depends.shape[-1]) + 1 < depends.shape[-1])
-        )
-    ]
+        return [Dependence(np.choose(chosen, alternatives))]
+    chosen_by = _spread(flagged(which.depends, False), shape)
+    return [Dependence(functools.reduce(np.logical_or, alternatives) | chosen_by)]
 
 
-def _moved(equation: Any, values: list[Value]) -> list[Value] | None:
+def _moved(equation: Any, values: list[Dependence]) -> list[Dependence] | None:
     found = sources(equation, lambda i: values[i].known)
     if found is None:
         return None
     which, places = found
     rows = [values[i].depends.reshape(-1, values[i].depends.shape[-1]) for i in which]
-    nowhere = np.arange(rows[0].shape[1]) == rows[0].shape[1] - 1  # some constant
-    table = np.concatenate([*rows, nowhere[None]])
-    return [Value(table[place]) for place in places]
+    constant = flagged(np.zeros((1, rows[0].shape[1]), bool), True)
+    table = np.concatenate([*rows, constant])
+    return [Dependence(table[place]) for place in places]
 
 
-def _reduced(equation: Any, values: list[Value]) -> list[Value]:
+def _reduced(equation: Any, values: list[Dependence]) -> list[Dependence]:
     axes = tuple(equation.params["axes"])
-    return [Value(value.depends.any(axis=axes)) for value in values]  # pyright: ignore[reportArgumentType]
+    return [Dependence(value.depends.any(axis=axes)) for value in values]  # pyright: ignore[reportArgumentType]
 
 
-def _cumulated(equation: Any, values: list[Value]) -> list[Value]:
+def _cumulated(equation: Any, values: list[Dependence]) -> list[Dependence]:
     axis, depends = equation.params["axis"], values[0].depends
     turn = (lambda x: np.flip(x, axis)) if equation.params.get("reverse") else (lambda x: x)
-    return [Value(turn(np.logical_or.accumulate(turn(depends), axis=axis)))]
+    return [Dependence(turn(np.logical_or.accumulate(turn(depends), axis=axis)))]
 
 
-def _contracted(equation: Any, values: list[Value]) -> list[Value]:
-    """A product of arrays, in which some numbers may be zero."""
+def _contracted(equation: Any, values: list[Dependence]) -> list[Dependence]:
+    """A sum of products, of which those with a zero do not count."""
     arrays = [value.depends.astype(np.float32) for value in values]
     a, b = arranged_factors(equation, arrays)
     depends = np.einsum("bisn,bjs->bijn", a, b[..., -1]) + np.einsum(
         "bis,bjsn->bijn", a[..., -1], b
     )
-    return [Value((depends > 0).reshape(*equation.outvars[0].aval.shape, -1))]
+    return [Dependence((depends > 0).reshape(*equation.outvars[0].aval.shape, -1))]
 
 
 def _landing(equation: Any, operand: tuple, indices: np.ndarray, update: tuple) -> np.ndarray:
-    """Where each number of the update of a scatter goes: its index in the flat operand, -1 if it is
-    dropped. Shapes of operand and update."""
+    """Return where each number of the update of a scatter goes: its index in the flat operand, -1 if
+    it is dropped. `operand` and `update` are shapes."""
     keep = ("indices_are_sorted", "unique_indices", "mode")
     settings = {name: equation.params[name] for name in keep}
 
@@ -156,7 +159,7 @@ def _landing(equation: Any, operand: tuple, indices: np.ndarray, update: tuple) 
     return np.asarray(np.rint(np.asarray(found)) - 1, int).reshape(update)
 
 
-def _scattered(equation: Any, values: list[Value]) -> list[Value] | None:
+def _scattered(equation: Any, values: list[Dependence]) -> list[Dependence] | None:
     operand, indices, update = values
     if indices.known is None:
         return None
@@ -164,10 +167,10 @@ def _scattered(equation: Any, values: list[Value]) -> list[Value] | None:
     places = _landing(equation, shape, indices.known, update.depends.shape[:-1]).ravel()
     lands = places >= 0
     result = operand.depends.reshape(-1, number).copy()
-    if equation.primitive.name == "scatter":  # what was there is replaced
+    if equation.primitive.name == "scatter":  # replaces the numbers there
         result[places[lands]] = False
     np.logical_or.at(result, places[lands], update.depends.reshape(-1, number)[lands])
-    return [Value(result.reshape(*shape, number))]
+    return [Dependence(result.reshape(*shape, number))]
 
 
 _REDUCTIONS = "reduce_and reduce_max reduce_min reduce_or reduce_prod reduce_sum reduce_xor"
@@ -177,7 +180,7 @@ _SCATTERS = """
     scatter_min scatter_mul scatter_sub
 """
 
-RULES: dict[str, Callable[[Any, list[Value]], list[Value] | None]] = {
+RULES: dict[str, Callable[[Any, list[Dependence]], list[Dependence] | None]] = {
     **dict.fromkeys(VANISHING, _vanishing),
     **dict.fromkeys(ELEMENTWISE, _elementwise),
     **dict.fromkeys(MOVES, _moved),

@@ -1,7 +1,7 @@
-"""Operations on numbers, with those on constants done while tracing.
+"""Arithmetic on numbers; operations on constants are done while tracing.
 
-Zeros that are known are taken to be exact: `0 x = 0` also where `x` is not finite. They are zeros
-of the structure, as in Jacobians and tableaus.
+Known zeros are taken to be exact: `0 x = 0` even if `x` is not finite. They are structural zeros,
+as in Jacobians and tableaus.
 """
 
 from collections.abc import Callable
@@ -12,7 +12,7 @@ from jax import lax
 
 from . import primitives
 from .lane_arrays import Lanes
-from .lane_value import Number, object_array, Value
+from .lane_value import LaneValue, Number, object_array
 from .primitives import evaluated, unsharded
 
 
@@ -21,7 +21,7 @@ ELEMENTWISE = frozenset({*primitives.VANISHING, *primitives.ELEMENTWISE}).union(
 )
 
 
-def elementwise(lanes: Lanes, equation: Any, values: list[Value]) -> list[Value]:
+def elementwise(lanes: Lanes, equation: Any, values: list[LaneValue]) -> list[LaneValue]:
     aval = equation.outvars[0].aval
     operands = [np.broadcast_to(v.numbers(), aval.shape) for v in values]
     params = unsharded(equation.params)
@@ -29,7 +29,7 @@ def elementwise(lanes: Lanes, equation: Any, values: list[Value]) -> list[Value]
         apply(lanes, equation.primitive, params, aval.dtype, [x[index] for x in operands])
         for index in np.ndindex(*aval.shape)
     ]
-    return [Value.of_numbers(object_array(out, aval.shape), aval.dtype)]
+    return [LaneValue.of_numbers(object_array(out, aval.shape), aval.dtype)]
 
 
 def apply(
@@ -68,7 +68,7 @@ def _mul(lanes: Lanes, params: Any, a: Number, b: Number) -> Number | None:
 
 
 def _logical(neutral: bool) -> Callable:
-    """`and` (`or`), in which `True` (`False`) changes nothing."""
+    """`and` (`or`); the constant `True` (`False`) is its neutral element."""
 
     def rule(lanes: Lanes, params: Any, a: Number, b: Number) -> Number | None:
         for x, y in ((a, b), (b, a)):

@@ -1,4 +1,4 @@
-"""What is known while a function is interpreted: how many lanes, what has been computed already."""
+"""The state of the interpreter: the number of lanes, and the operations computed so far."""
 
 import contextlib
 from collections.abc import Iterator
@@ -13,25 +13,25 @@ from .lane_value import Node, Number
 
 
 class NotScalarError(Exception):
-    """The function cannot be treated, or would become too long."""
+    """Raised for a function without a rule, or with too many operations."""
 
 
-# XLA for CPUs copies a result into every kernel that needs it, with all that leads to it, unless it is
-# one of these.
+# XLA for CPUs copies a result, with all that leads to it, into every kernel that needs it, except
+# for results of these operations.
 _COMPUTED_ONCE = frozenset(
     "acos acosh asin asinh atan atan2 atanh cbrt cosh div erf exp exp2 expm1 log log1p logistic pow rem "
     "rsqrt sinh sqrt tan tanh".split()
 )
-# Those take as long as many other operations, but are not among them.
+# Not among them, but as expensive as this many other operations.
 _LONG = {"sin": 50, "cos": 50}
-# Operations that may be copied. A division, which is what it takes to have a result computed once,
-# takes as long. (Measured: 16 is 5 % faster than 8, and compiles in 0.9 of the time.)
+# Largest number of operations that may be copied. A division, the cost of having a result computed
+# once, takes as long. (Measured: 16 is 5 % faster than 8, and compiles in 0.9 of the time.)
 _DIVISION = 16
 
 
 class Lanes:
-    """`count` trajectories. `limit` is the largest number of operations; `whole` collects the names
-    of operations that were done on whole arrays, as there is no rule for them."""
+    """`count` trajectories, one in each lane. `limit` is the largest number of operations; `whole`
+    collects the names of primitives without a rule, which are applied to whole arrays."""
 
     def __init__(self, count: int, limit: int):
         self.count, self.limit = count, limit
@@ -42,11 +42,11 @@ class Lanes:
 
     @contextlib.contextmanager
     def inside(self, finite: jax.Array | None = None) -> Iterator[None]:
-        """The body of a loop: what is computed in it is not known outside. `finite` are numbers of
-        all lanes that are never infinite."""
+        """Enter the body of a loop: results computed in it are not known outside. `finite` is a
+        column of numbers that are never infinite."""
         before = self._one
         if finite is not None:
-            # A one that XLA cannot tell from other numbers.
+            # A one that XLA does not recognize as a constant.
             self._one = jnp.where(finite == finite, jnp.ones_like(finite), finite)
         self._known.append({})
         yield
@@ -54,14 +54,14 @@ class Lanes:
         self._one = before
 
     def apply(self, primitive: Any, params: dict[str, Any], dtype: Any, *numbers: Number) -> Node:
-        """One operation on numbers, of which not all are constants; once, whoever asks for it."""
+        """Return the node of an operation on numbers that are not all constants; equal ones share it."""
         key = self._key(primitive, params, numbers)
         if key is not None and key in self._known[-1]:
             return self._known[-1][key]
         self.count_operations(1)
         node = Node(primitive, params, dtype, numbers)
         if key is not None:
-            self._known[-1][key] = node  # which keeps its operands, and so their identities
+            self._known[-1][key] = node  # keeps its operands alive, and so their ids
         return node
 
     def count_operations(self, count: int) -> None:
@@ -70,14 +70,14 @@ class Lanes:
             raise NotScalarError(f"more than {self.limit} operations")
 
     def array(self, x: Number, dtype: Any) -> jax.Array:
-        """One for each lane."""
+        """Return one number for each lane, shape `(count,)`."""
         x = self.emitted(x)
         if isinstance(x, np.generic):
             return lax.full((self.count,), x, dtype)  # pyright: ignore[reportArgumentType]
         return x if x.ndim == 1 else lax.broadcast(x, (self.count,))
 
     def emitted(self, x: Number) -> Any:
-        """A number as XLA is given it."""
+        """Return a number once its operation has been given to XLA; constants stay as they are."""
         if not isinstance(x, Node):
             return x
         pending = [x]

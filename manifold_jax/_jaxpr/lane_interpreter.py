@@ -1,4 +1,4 @@
-"""The interpreter: a traced function, evaluated with numbers instead of arrays."""
+"""The interpreter: evaluates a traced function with numbers instead of arrays."""
 
 import functools
 from collections.abc import Callable
@@ -12,20 +12,20 @@ from jax import lax
 from . import lane_structure as structure
 from .lane_arithmetic import apply, ELEMENTWISE, elementwise
 from .lane_arrays import Lanes, NotScalarError
-from .lane_value import Columns, object_array, Value, where
+from .lane_value import Columns, LaneValue, object_array, where
 from .primitives import MOVES
 from .trace import called, example, unrolled_scan, walk
 
 
-# Numbers of an array beyond which it stays one.
+# Arrays with more numbers than this stay whole.
 _LARGEST_ARRAY = 1000
-# Repetitions that are written out.
+# Loops with at most this many iterations are written out.
 _LONGEST_WRITTEN_OUT = 16
 
 
 def call_in_lanes(lanes: Lanes, function: Callable, *args: Any) -> Any:
-    """`function(*args)` in every lane. Leaves of `args` are [`Value`][]s, those of what is returned,
-    too. What the function closes over is the same in every lane."""
+    """Return `function(*args)` in every lane. Leaves of `args` and of the result are [`LaneValue`][]s.
+    Arrays that the function closes over are the same in every lane."""
     leaves, treedef = jtu.tree_flatten(args)
     examples = jtu.tree_unflatten(treedef, [example(v.shape, v.dtype) for v in leaves])
     closed, shape = jax.make_jaxpr(function, return_shape=True)(*examples)
@@ -33,12 +33,12 @@ def call_in_lanes(lanes: Lanes, function: Callable, *args: Any) -> Any:
     return jtu.tree_unflatten(jtu.tree_structure(shape), out)
 
 
-def evaluate(lanes: Lanes, function: Any, values: list[Value]) -> list[Value]:
-    """A jaxpr, with or without its constants."""
-    return walk(function, values, Value.of_constant, functools.partial(_evaluated, lanes))
+def evaluate(lanes: Lanes, function: Any, values: list[LaneValue]) -> list[LaneValue]:
+    """Evaluate a jaxpr, with or without its constants."""
+    return walk(function, values, LaneValue.of_constant, functools.partial(_evaluated, lanes))
 
 
-def _evaluated(lanes: Lanes, equation: Any, values: list[Value]) -> list[Value]:
+def _evaluated(lanes: Lanes, equation: Any, values: list[LaneValue]) -> list[LaneValue]:
     name = equation.primitive.name
     if any(jax.dtypes.issubdtype(v.aval.dtype, jax.dtypes.extended) for v in equation.outvars):  # pyright: ignore[reportPrivateImportUsage]
         raise NotScalarError(f"`{name}` makes random keys")
@@ -53,8 +53,8 @@ def _evaluated(lanes: Lanes, equation: Any, values: list[Value]) -> list[Value]:
     return _on_whole_arrays(lanes, equation, values) if out is None else out
 
 
-def _on_whole_arrays(lanes: Lanes, equation: Any, values: list[Value]) -> list[Value]:
-    """What there is no rule for: the operation itself, mapped over the lanes."""
+def _on_whole_arrays(lanes: Lanes, equation: Any, values: list[LaneValue]) -> list[LaneValue]:
+    """Apply a primitive without a rule to whole arrays, mapped over the lanes."""
     lanes.whole.add(equation.primitive.name)
     lanes.count_operations(1)
 
@@ -63,20 +63,20 @@ def _on_whole_arrays(lanes: Lanes, equation: Any, values: list[Value]) -> list[V
         return list(out) if equation.primitive.multiple_results else [out]
 
     if not values:
-        return [Value.of_constant(x) for x in bind()]
+        return [LaneValue.of_constant(x) for x in bind()]
     out = jax.vmap(bind, in_axes=-1, out_axes=-1)(*(v.whole(lanes) for v in values))
-    return [Value.of_whole(x) for x in out]
+    return [LaneValue.of_whole(x) for x in out]
 
 
-def _linear_solve(lanes: Lanes, equation: Any, values: list[Value]) -> list[Value]:
+def _linear_solve(lanes: Lanes, equation: Any, values: list[LaneValue]) -> list[LaneValue]:
     lengths, jaxprs = equation.params["const_lengths"], equation.params["jaxprs"]
     before = lengths.matvec + lengths.vecmat
     constants = values[before : before + lengths.solve]
     return evaluate(lanes, jaxprs.solve, constants + values[sum(lengths) :])
 
 
-def _cond(lanes: Lanes, equation: Any, values: list[Value]) -> list[Value]:
-    """All branches, unless it is known which is taken."""
+def _cond(lanes: Lanes, equation: Any, values: list[LaneValue]) -> list[LaneValue]:
+    """Evaluate all branches, unless the index is known."""
     which, *operands = values
     branches = equation.params["branches"]
     if which.is_known:
@@ -92,31 +92,31 @@ def _cond(lanes: Lanes, equation: Any, values: list[Value]) -> list[Value]:
     return chosen
 
 
-def _selected(lanes: Lanes, here: Any, a: Value, b: Value) -> Value:
+def _selected(lanes: Lanes, here: Any, a: LaneValue, b: LaneValue) -> LaneValue:
     pairs = zip(a.numbers().ravel(), b.numbers().ravel(), strict=True)
     out = [apply(lanes, lax.select_n_p, {}, a.dtype, [here, y, x]) for x, y in pairs]
-    return Value.of_numbers(object_array(out, a.shape), a.dtype)
+    return LaneValue.of_numbers(object_array(out, a.shape), a.dtype)
 
 
-def _scan(lanes: Lanes, equation: Any, values: list[Value]) -> list[Value] | None:
+def _scan(lanes: Lanes, equation: Any, values: list[LaneValue]) -> list[LaneValue] | None:
     if equation.params["length"] > _LONGEST_WRITTEN_OUT:
         return None
 
-    def item(x: Value, i: int) -> Value:
-        return Value.of_numbers(
+    def item(x: LaneValue, i: int) -> LaneValue:
+        return LaneValue.of_numbers(
             object_array(list(x.numbers()[i : i + 1].flat), x.shape[1:]), x.dtype
         )
 
-    def stack(rows: list[Value], aval: Any) -> Value:
+    def stack(rows: list[LaneValue], aval: Any) -> LaneValue:
         numbers = [x for row in rows for x in row.numbers().flat]
-        return Value.of_numbers(object_array(numbers, aval.shape), aval.dtype)
+        return LaneValue.of_numbers(object_array(numbers, aval.shape), aval.dtype)
 
     through = functools.partial(evaluate, lanes)
     return unrolled_scan(equation, values, through, item, stack)
 
 
-def _while_loop(lanes: Lanes, equation: Any, values: list[Value]) -> list[Value]:
-    """Evaluate a loop for as long as any lane goes on; the others keep what they have."""
+def _while_loop(lanes: Lanes, equation: Any, values: list[LaneValue]) -> list[LaneValue]:
+    """Evaluate a loop for as long as any lane goes on; the others keep their values."""
     params = equation.params
     m, n = params["cond_nconsts"], params["body_nconsts"]
     entering = lambda values: [value.entering(lanes) for value in values]

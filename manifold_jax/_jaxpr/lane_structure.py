@@ -1,4 +1,4 @@
-"""Operations that move numbers, and sums of them."""
+"""Primitives that move numbers, and sums of them."""
 
 import functools
 import math
@@ -10,12 +10,13 @@ from jax import lax
 
 from .lane_arithmetic import apply
 from .lane_arrays import Lanes, NotScalarError
-from .lane_value import object_array, Value
+from .lane_value import LaneValue, object_array
 from .primitives import arranged_factors, evaluated, sources
 
 
-def move(lanes: Lanes, equation: Any, values: list[Value]) -> list[Value] | None:
-    """`None` if it depends on numbers that are not constants where they go, or if others come in."""
+def move(lanes: Lanes, equation: Any, values: list[LaneValue]) -> list[LaneValue] | None:
+    """Move numbers. Returns `None` if the destinations depend on numbers that are not constants, or if other
+    numbers than those of the operand come in."""
     known = lambda i: values[i].known() if values[i].is_known else None
     found = sources(equation, known)
     if found is None or any((place < 0).any() for place in found[1]):
@@ -23,28 +24,28 @@ def move(lanes: Lanes, equation: Any, values: list[Value]) -> list[Value] | None
     which, places = found
     numbers = np.concatenate([values[i].numbers().ravel() for i in which])
     return [
-        Value.of_numbers(numbers[place.ravel()].reshape(place.shape), out.aval.dtype)
+        LaneValue.of_numbers(numbers[place.ravel()].reshape(place.shape), out.aval.dtype)
         for place, out in zip(places, equation.outvars, strict=True)
     ]
 
 
-def iota(lanes: Lanes, equation: Any, values: list[Value]) -> list[Value]:
-    return [Value.of_constant(x) for x in evaluated(equation.primitive, equation.params, [])]
+def iota(lanes: Lanes, equation: Any, values: list[LaneValue]) -> list[LaneValue]:
+    return [LaneValue.of_constant(x) for x in evaluated(equation.primitive, equation.params, [])]
 
 
-def platform(lanes: Lanes, equation: Any, values: list[Value]) -> list[Value]:
-    """Which of several implementations is meant for the device."""
+def platform(lanes: Lanes, equation: Any, values: list[LaneValue]) -> list[LaneValue]:
+    """Choose the implementation for the device among several."""
     for i, names in enumerate(equation.params["platforms"]):
         if names is None or jax.default_backend() in names:
-            return [Value.of_constant(np.int32(i))]
+            return [LaneValue.of_constant(np.int32(i))]
     raise NotScalarError("there is no implementation for this device")
 
 
-# Products beyond which a matrix product stays one.
+# Matrix products with more multiplications than this stay whole.
 _LARGEST_DOT = 2000
 
 
-def dot_general(lanes: Lanes, equation: Any, values: list[Value]) -> list[Value] | None:
+def dot_general(lanes: Lanes, equation: Any, values: list[LaneValue]) -> list[LaneValue] | None:
     aval = equation.outvars[0].aval
     length = math.prod(values[0].shape[i] for i in equation.params["dimension_numbers"][0][0])
     if math.prod(aval.shape) * length > _LARGEST_DOT or values[0].dtype != values[1].dtype:
@@ -60,7 +61,9 @@ def dot_general(lanes: Lanes, equation: Any, values: list[Value]) -> list[Value]
         return functools.reduce(functools.partial(combine, lax.add_p), products, zero)
 
     indices = np.ndindex(A.shape[0], A.shape[1], B.shape[1])
-    return [Value.of_numbers(object_array([entry(*i) for i in indices], aval.shape), aval.dtype)]
+    return [
+        LaneValue.of_numbers(object_array([entry(*i) for i in indices], aval.shape), aval.dtype)
+    ]
 
 
 REDUCTIONS = {
@@ -73,7 +76,7 @@ REDUCTIONS = {
 }
 
 
-def reduce(lanes: Lanes, equation: Any, values: list[Value]) -> list[Value] | None:
+def reduce(lanes: Lanes, equation: Any, values: list[LaneValue]) -> list[LaneValue] | None:
     primitive, aval = REDUCTIONS[equation.primitive.name], equation.outvars[0].aval
     if primitive in (lax.and_p, lax.or_p) and aval.dtype != bool:
         return None
@@ -84,4 +87,4 @@ def reduce(lanes: Lanes, equation: Any, values: list[Value]) -> list[Value] | No
         return None
     combine = lambda a, b: apply(lanes, primitive, {}, aval.dtype, [a, b])
     out = [functools.reduce(combine, x[index]) for index in np.ndindex(*aval.shape)]
-    return [Value.of_numbers(object_array(out, aval.shape), aval.dtype)]
+    return [LaneValue.of_numbers(object_array(out, aval.shape), aval.dtype)]

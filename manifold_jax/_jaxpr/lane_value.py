@@ -1,4 +1,4 @@
-"""An array that every lane has one of, as separate numbers or as a whole."""
+"""Arrays that every lane has its own values of, as separate numbers or as a whole."""
 
 import math
 from collections.abc import Callable
@@ -15,8 +15,8 @@ from .trace import example
 
 
 class Node:
-    """An operation on numbers that is not yet given to XLA: once it is, `array` is its result. How
-    often it is used, and how many operations a copy of it would repeat."""
+    """An operation on numbers that has not been given to XLA yet; `array` is its result once it
+    has. `uses` counts how often it is used, `copied` the operations that a copy of it would repeat."""
 
     __slots__ = ("array", "copied", "dtype", "operands", "params", "primitive", "uses")
 
@@ -28,18 +28,18 @@ class Node:
                 x.uses += 1
 
 
-# A constant that is the same in every lane and known while tracing (`np.generic`), a number that is
+# One number in every lane: a constant that is known while tracing (`np.generic`), a number that is
 # the same in every lane (an array of shape ()), one for each lane (an array of shape (lanes,)), or
-# one that is still to be computed.
+# one still to be computed (`Node`).
 Number = Any
 
 
-class Value:
-    """An array of shape `shape` in each lane. `numbers()` is an object array of that shape of
-    [`Number`][]s; `whole(lanes)` an array of shape `(*shape, count)`: the lanes are contiguous in
-    memory.
+class LaneValue:
+    """An array of shape `shape` in each lane, in two forms. `numbers()` is an object array of that
+    shape of [`Number`][]s; `whole(lanes)` an array of shape `(*shape, count)`: the lanes are
+    contiguous in memory.
 
-    Whichever is not there is made when it is asked for.
+    The missing form is computed lazily.
     """
 
     def __init__(self, shape: tuple[int, ...], dtype: Any, make: Callable[[], np.ndarray]):
@@ -47,24 +47,24 @@ class Value:
         self._make, self._numbers, self._whole = make, None, None
 
     @staticmethod
-    def of_numbers(numbers: np.ndarray, dtype: Any) -> "Value":
-        return Value(numbers.shape, dtype, lambda: numbers)
+    def of_numbers(numbers: np.ndarray, dtype: Any) -> "LaneValue":
+        return LaneValue(numbers.shape, dtype, lambda: numbers)
 
     @staticmethod
-    def of_constant(x: Any) -> "Value":
-        """The same in every lane: an array, also one that is being traced."""
+    def of_constant(x: Any) -> "LaneValue":
+        """Make a value that is the same in every lane from an array, which may be traced."""
         x = x if isinstance(x, jax.core.Tracer) else np.asarray(x)
-        return Value(x.shape, x.dtype, lambda: _split(x, x.shape))
+        return LaneValue(x.shape, x.dtype, lambda: _split(x, x.shape))
 
     @staticmethod
-    def of_column(x: jax.Array) -> "Value":
+    def of_column(x: jax.Array) -> "LaneValue":
         """Make a value from one number of each lane."""
-        return Value.of_numbers(object_array([x], ()), x.dtype)
+        return LaneValue.of_numbers(object_array([x], ()), x.dtype)
 
     @staticmethod
-    def of_whole(x: jax.Array) -> "Value":
+    def of_whole(x: jax.Array) -> "LaneValue":
         """Make a value from one array whose last axis is that of the lanes."""
-        value = Value(x.shape[:-1], x.dtype, lambda: _split(x, x.shape[:-1]))
+        value = LaneValue(x.shape[:-1], x.dtype, lambda: _split(x, x.shape[:-1]))
         value._whole = x
         return value
 
@@ -82,20 +82,20 @@ class Value:
         return self._whole
 
     def columns(self, lanes: Any) -> list[jax.Array]:
-        """One array of all lanes for each number."""
+        """Return one array of shape `(count,)` for each number."""
         return [lanes.array(x, self.dtype) for x in self.numbers().ravel()]
 
-    def entering(self, lanes: Any) -> "Value":
-        """Return the value for the body of a loop, in which nothing may be made that is kept
-        outside."""
+    def entering(self, lanes: Any) -> "LaneValue":
+        """Return the value for the body of a loop. All operations on it are done before: results
+        made inside are not known outside."""
         numbers = [lanes.emitted(x) for x in self.numbers().ravel()]
-        value = Value.of_numbers(object_array(numbers, self.shape), self.dtype)
+        value = LaneValue.of_numbers(object_array(numbers, self.shape), self.dtype)
         value._whole = self._whole
         return value
 
     @property
     def is_known(self) -> bool:
-        """Whether it is a constant, of which all can be computed while tracing."""
+        """Whether all its numbers are constants known while tracing."""
         return all(isinstance(x, np.generic) for x in self.numbers().flat)
 
     def known(self) -> np.ndarray:
@@ -103,7 +103,7 @@ class Value:
 
 
 def object_array(items: list[Any], shape: tuple[int, ...]) -> np.ndarray:
-    """Return an object array of objects that are arrays themselves, which NumPy would look into."""
+    """Return an object array of arrays, which NumPy would otherwise convert."""
     out = np.empty(len(items), object)
     for i, item in enumerate(items):
         out[i] = item
@@ -114,61 +114,61 @@ def _split(x: Any, shape: tuple[int, ...]) -> np.ndarray:
     return object_array([x[index] for index in np.ndindex(*shape)], shape)
 
 
-class Layout(NamedTuple):
-    """How columns, one number of each lane or each trajectory, make up a tree."""
+class ColumnLayout(NamedTuple):
+    """The structure of a tree that is stored as columns."""
 
     treedef: Any
     shapes: tuple[tuple[int, ...], ...]
     dtypes: tuple[np.dtype, ...]
 
     @staticmethod
-    def of(tree: Any) -> "Layout":
-        """Return the layout of a tree of [`Value`][]s, or of arrays of one trajectory."""
+    def of(tree: Any) -> "ColumnLayout":
+        """Return the layout of a tree of [`LaneValue`][]s, or of arrays of one trajectory."""
         leaves, treedef = jtu.tree_flatten(tree)
         dtypes = (np.dtype(x.dtype) for x in leaves)
-        return Layout(treedef, tuple(x.shape for x in leaves), tuple(dtypes))
+        return ColumnLayout(treedef, tuple(x.shape for x in leaves), tuple(dtypes))
 
     @staticmethod
-    def of_one(tree: Any) -> "Layout":
-        """Return the layout of one of the trajectories that arrays have in front."""
-        return Layout.of(jtu.tree_map(lambda x: example(x.shape[1:], x.dtype), tree))
+    def of_one(tree: Any) -> "ColumnLayout":
+        """Return the layout of one trajectory of arrays with the trajectories in front."""
+        return ColumnLayout.of(jtu.tree_map(lambda x: example(x.shape[1:], x.dtype), tree))
 
     def dtypes_of_columns(self) -> list[np.dtype]:
         each = zip(self.shapes, self.dtypes, strict=True)
         return [dtype for shape, dtype in each for _ in range(math.prod(shape))]
 
     def example(self) -> Any:
-        """Return an example to trace functions of one trajectory with."""
+        """Return an example with which functions of one trajectory are traced."""
         return jtu.tree_unflatten(self.treedef, list(map(example, self.shapes, self.dtypes)))
 
 
 class Columns(eqx.Module):
-    """A tree as a list of columns."""
+    """A tree as a list of columns: one array for each number, over all lanes or all trajectories."""
 
     columns: list[jax.Array]
-    layout: Layout = eqx.field(static=True)
+    layout: ColumnLayout = eqx.field(static=True)
 
     @staticmethod
-    def zeros(layout: Layout, count: int) -> "Columns":
+    def zeros(layout: ColumnLayout, count: int) -> "Columns":
         return Columns([jnp.zeros(count, dtype) for dtype in layout.dtypes_of_columns()], layout)
 
     @staticmethod
     def of_values(tree: Any, lanes: Any) -> "Columns":
         columns = [column for value in jtu.tree_leaves(tree) for column in value.columns(lanes)]
-        return Columns(columns, Layout.of(tree))
+        return Columns(columns, ColumnLayout.of(tree))
 
     @staticmethod
     def of_arrays(tree: Any) -> "Columns":
         """Return the columns of arrays with the trajectories in front."""
         flat = lambda leaf: leaf.reshape(leaf.shape[0], math.prod(leaf.shape[1:]))
         columns = [column for leaf in jtu.tree_leaves(tree) for column in flat(leaf).T]
-        return Columns(columns, Layout.of_one(tree))
+        return Columns(columns, ColumnLayout.of_one(tree))
 
     def values(self) -> Any:
         out, k = [], 0
         for shape, dtype in zip(self.layout.shapes, self.layout.dtypes, strict=True):
             numbers = object_array(self.columns[k : k + math.prod(shape)], shape)
-            out.append(Value.of_numbers(numbers, dtype))
+            out.append(LaneValue.of_numbers(numbers, dtype))
             k += numbers.size
         return jtu.tree_unflatten(self.layout.treedef, out)
 
@@ -176,7 +176,7 @@ class Columns(eqx.Module):
         """Return arrays with the trajectories in front."""
         rows = self.columns[0].shape[0] if self.columns else 0
 
-        def array(value: Value) -> jax.Array:
+        def array(value: LaneValue) -> jax.Array:
             numbers = list(value.numbers().flat)
             found = jnp.stack(numbers, axis=1) if numbers else jnp.zeros(0, value.dtype)
             return found.reshape(rows, *value.shape)

@@ -1,4 +1,4 @@
-"""Primitives of JAX: their values for operands that are known, and those that only move numbers."""
+"""Primitives of JAX: their values for known operands, and those that only move numbers."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 
-# Number by number: those of which zeros give zero, and others.
+# Elementwise primitives: those whose value at zeros is zero, and others.
 VANISHING = """
     abs add add_any asin asinh atan atanh cbrt ceil convert_element_type copy erf expm1 floor imag
     log1p max min neg real reduce_precision round sign sin sinh sqrt square stop_gradient sub tan tanh
@@ -66,7 +66,7 @@ _COMPUTED_BY_NUMPY: dict[str, Callable[..., np.ndarray]] = {
 
 
 def evaluated(primitive: Any, params: dict, operands: Sequence[Any]) -> list[np.ndarray]:
-    """Return the results for operands that are known, by NumPy where that is quicker."""
+    """Return the results for known operands, by NumPy where that is quicker."""
     name = primitive.name
     if name in _MOVED_BY_NUMPY:
         return [_MOVED_BY_NUMPY[name](params, *operands)]
@@ -80,11 +80,11 @@ def evaluated(primitive: Any, params: dict, operands: Sequence[Any]) -> list[np.
 
 
 def unsharded(params: dict) -> dict:
-    """Return the parameters of the primitive for arrays of this device."""
+    """Return the parameters of the primitive for arrays of a single device."""
     return {**params, "sharding": None} if "sharding" in params else params
 
 
-# Which operands are moved; what follows them says where to.
+# The operands that are moved; those after them say where to.
 _MOVED = dict.fromkeys(_MOVED_BY_NUMPY, slice(1)) | {
     "concatenate": slice(None),
     "dynamic_slice": slice(1),
@@ -105,10 +105,11 @@ def sources(
     equation: Any, known: Callable[[int], np.ndarray | None]
 ) -> tuple[Sequence[int], list[np.ndarray]] | None:
     """Return which operands are moved, and for each number of the results its index among all
-    numbers of these, negative where a constant is filled in. `None` if that depends on operands that
-    are not known.
+    numbers of these, negative where a constant is filled in. `None` if that depends on operands
+    that are not known.
 
-    The primitive itself is asked where each number goes, with their indices for numbers."""
+    Found by applying the primitive to indices instead of numbers.
+    """
     which = range(len(equation.invars))[_MOVED[equation.primitive.name]]
     start, operands = 0, []
     for i, variable in enumerate(equation.invars):
@@ -126,8 +127,8 @@ def sources(
 
 
 def arranged_factors(equation: Any, factors: Sequence[np.ndarray]) -> list[np.ndarray]:
-    """The factors of a product of arrays, each with one axis of what is common to both, one of what
-    is its own and one of what is summed over, and further ones that arrays of numbers do not have."""
+    """Return the factors of a `dot_general` with their axes rearranged: one that both have in common,
+    one of the factor's own, one that is summed over, and trailing ones absent in arrays of numbers."""
     out = []
     axes = equation.params["dimension_numbers"]
     for variable, x, summed, batch in zip(equation.invars, factors, *axes, strict=True):

@@ -1,4 +1,4 @@
-"""Traced functions: walked through with values of any kind in the place of arrays, and their length."""
+"""Walks through traced functions with values of any kind in the place of arrays."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -12,9 +12,8 @@ from .._base.compat import scan_counts
 
 
 def walk(function: Any, inputs: Sequence[Any], constant: Callable, apply: Callable) -> list[Any]:
-    """Return what a jaxpr, with or without its constants, makes of the values `inputs`, in the
-    order of execution. `constant(x)` is the value of a constant; `apply(equation, values)` are those
-    of the results of an equation."""
+    """Evaluate a jaxpr, with or without its constants, at the values `inputs`, in order. `constant(x)`
+    is the value of a constant; `apply(equation, values)` returns those of the results of an equation."""
     jaxpr, constants = getattr(function, "jaxpr", function), getattr(function, "consts", ())
     known = dict(zip(jaxpr.constvars, map(constant, constants), strict=True))
     known.update(zip(jaxpr.invars, inputs, strict=True))
@@ -30,7 +29,7 @@ def walk(function: Any, inputs: Sequence[Any], constant: Callable, apply: Callab
 
 
 def called(equation: Any) -> Any:
-    """The function that an equation applies to exactly its operands, if that is what it does."""
+    """Return the function that an equation applies to exactly its operands, if it does only that."""
     shapes = lambda variables: [variable.aval.shape for variable in variables]
     kinds = jax_core.Jaxpr | jax_core.ClosedJaxpr
     inner = [p for p in equation.params.values() if isinstance(p, kinds)]
@@ -44,8 +43,8 @@ def called(equation: Any) -> Any:
 def unrolled_scan(
     equation: Any, values: list[Any], through: Callable, item: Callable, stack: Callable
 ) -> list[Any]:
-    """A scan, iteration by iteration. `through(function, values)` are the values that the body
-    returns, `item(value, i)` is one row, and `stack(values, aval)` puts rows together."""
+    """Evaluate a scan iteration by iteration. `through(function, values)` evaluates the body,
+    `item(value, i)` is one row, and `stack(values, aval)` puts rows together."""
     (n, m), params = scan_counts(equation), equation.params
     constants, carry, xs = values[:n], values[n : n + m], values[n + m :]
     rows: list[list[Any]] = [[]] * params["length"]
@@ -57,9 +56,8 @@ def unrolled_scan(
 
 
 def example(shape: tuple[int, ...], dtype: Any) -> jax.ShapeDtypeStruct:
-    """Return the shape and type of an array of one lane. Inside `jax.shard_map` the types of
-    arrays name the mesh, and `eqx.filter_closure_convert` refuses those that do not where it has
-    seen others."""
+    """Return the shape and dtype of an array of one lane. Inside `jax.shard_map` the types of arrays
+    name the mesh, and `eqx.filter_closure_convert` refuses types without it after one with it."""
     mesh = jax.sharding.get_abstract_mesh()
     if mesh.empty:
         return jax.ShapeDtypeStruct(shape, dtype)

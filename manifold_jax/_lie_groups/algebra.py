@@ -22,7 +22,7 @@ from jaxtyping import Array, Bool, Float
 Vector = Float[Array, "3"]
 Scalar = Float[Array, ""]
 
-# Angles, squared, below which functions of them are computed by their Taylor series: 9 terms.
+# Squares of angles below which functions of them are computed by their Taylor series: 9 terms.
 _SMALL = 0.25
 _TERMS = 9
 
@@ -41,12 +41,12 @@ def hat(w: Vector) -> Float[Array, "3 3"]:
 
 
 def vee(A: Float[Array, "3 3"]) -> Vector:
-    """The vector of the skew part."""
+    """Return the vector of the skew part."""
     return jnp.stack([A[2, 1] - A[1, 2], A[0, 2] - A[2, 0], A[1, 0] - A[0, 1]]) / 2
 
 
 class Rotation(NamedTuple):
-    r"""$I + p\,\hat w + q\,\hat w^2$, and the quaternion $(s, u\,w)$ of it."""
+    r"""$I + p\,\hat w + q\,\hat w^2$, and its quaternion $(s, u\,w)$."""
 
     w: Vector
     p: Scalar
@@ -74,7 +74,7 @@ class Rotation(NamedTuple):
 
 
 def rotation_rate(w: Vector, velocity: Vector, cayley: bool) -> Vector:
-    r"""$w'$ for the angular velocity $\omega$ in the frame of the body:
+    r"""Return $w'$ for the angular velocity $\omega$ in the frame of the body:
     $\omega + w \times \omega / 2 + \gamma\, w \times (w \times \omega)$,
     $\gamma = (1 - \frac\theta2 \cot\frac\theta2) / \theta^2$; for Cayley's map
     $\omega + w \times \omega / 2 + w\,(w \cdot \omega) / 4$."""
@@ -85,8 +85,8 @@ def rotation_rate(w: Vector, velocity: Vector, cayley: bool) -> Vector:
 
 
 def is_within_half_a_turn(w: Vector, cayley: bool) -> Bool[Array, ""]:
-    """Return whether `w` is a turn by less than half a revolution. By Cayley's map every `w` is,
-    as it turns by `2 arctan(|w| / 2)`."""
+    """Whether `w` is a turn by less than half a revolution. By Cayley's map every `w` is, as it turns
+    by `2 arctan(|w| / 2)`."""
     square = jnp.sum(w * w)
     return jnp.isfinite(square) if cayley else square < jnp.pi**2
 

@@ -18,7 +18,7 @@ class LieGroupChart(mj.AbstractChart):
 
     $$y = y_0\,\phi(w), \qquad w' = d\phi_w^{-1}(\xi), \quad \xi = y^{-1} f(t, y), \quad w(t_0) = 0,$$
 
-    with the exponential or Cayley's map $\phi$. The order of the wrapped solver is kept.
+    with the exponential or Cayley's map $\phi$. The order of the wrapped solver is preserved.
 
     ```python
     def field(t, y, args):
@@ -77,7 +77,7 @@ class LieGroupChart(mj.AbstractChart):
         return self.moved
 
     def moved(self, y: Any, w: list[Any]) -> Any:
-        r"""$y_0\,\phi(w)$, part by part; of ordinary components `w` itself."""
+        r"""Return $y_0\,\phi(w)$, part by part; for ordinary components `w` itself."""
         cayley = self.coordinates == "cayley"
         parts = [
             w if group is None else group.moved(y, w, cayley)
@@ -86,7 +86,7 @@ class LieGroupChart(mj.AbstractChart):
         return jtu.tree_unflatten(jtu.tree_structure(self.groups, is_leaf=_is_group), parts)
 
     def rate(self, w: list[Any], y: Any, vector: Any) -> list[Any]:
-        """The velocity of `w` for a velocity of the state `y`."""
+        """Return the velocity of `w` for a velocity of the state `y`."""
         cayley = self.coordinates == "cayley"
         parts = zip(self.parts(y), self.parts(vector), w, strict=True)
         return [
@@ -100,7 +100,7 @@ class LieGroupChart(mj.AbstractChart):
             parts = list(zip(groups, structure.flatten_up_to(y), strict=True))
         except ValueError:
             parts = None
-        # A group is of one array, not of all that is in a part of the state.
+        # A group acts on one array, not on all arrays in a part of the state.
         if parts is None or not all(group is None or eqx.is_array(y) for group, y in parts):
             raise ValueError(
                 f"`groups` of `mj.LieGroupChart` must be like the state, {jtu.tree_structure(y)}, with a group or None "

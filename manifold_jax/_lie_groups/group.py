@@ -1,4 +1,4 @@
-"""What a Lie group has to provide to be integrated in its algebra."""
+"""The interface of Lie groups that can be integrated in their algebra."""
 
 import abc
 from typing import Any
@@ -19,28 +19,27 @@ class AbstractLieGroup(eqx.Module):
 
     @abc.abstractmethod
     def tangent(self, y: Array, velocity: Float[Array, " d"]) -> Array:
-        r"""The velocity $y\,\xi$ of the state, like `y`: for vector fields that are known in the
-        algebra."""
+        r"""Return the velocity $y\,\xi$ of the state, like `y`, for fields known in the algebra."""
 
     @abc.abstractmethod
     def velocity(self, y: Array, tangent: Array) -> Float[Array, " d"]:
-        r"""The inverse, $\xi = y^{-1} y'$."""
+        r"""Return the inverse, $\xi = y^{-1} y'$."""
 
     @abc.abstractmethod
     def moved(self, y: Array, w: Float[Array, " d"], cayley: bool) -> Array:
-        r"""$y\,\phi(w)$."""
+        r"""Return $y\,\phi(w)$."""
 
     @abc.abstractmethod
     def rate(
         self, w: Float[Array, " d"], velocity: Float[Array, " d"], cayley: bool
     ) -> Float[Array, " d"]:
-        r"""$w'$ where $y_0 \phi(w)$ has the velocity $\xi$: the inverse of the derivative of
+        r"""Return $w'$ where $y_0 \phi(w)$ has the velocity $\xi$: the inverse of the derivative of
         $\phi$ applied to it."""
 
     @abc.abstractmethod
     def is_within(self, w: Float[Array, " d"], cayley: bool) -> Bool[Array, ""]:
-        r"""Whether $\phi$ is a chart at `w`, well inside; a step that leads out of it is rejected.
-        False for what is not finite."""
+        r"""Whether $\phi$ is a chart at `w`, well inside; a step that leaves it is rejected. False if
+        `w` is not finite."""
 
 
 def check_shape(y: Any, shape: tuple[int, ...], group: str) -> None:

@@ -1,4 +1,4 @@
-"""Motions of a rigid body: rotation and translation together."""
+"""Rigid-body motions: rotation and translation together."""
 
 from typing import ClassVar
 

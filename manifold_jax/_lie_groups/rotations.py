@@ -1,4 +1,4 @@
-"""Rotations: matrices and unit quaternions, of which the algebra is that of vectors."""
+"""Rotations as matrices and as unit quaternions; their algebra is that of vectors."""
 
 from typing import ClassVar
 
@@ -68,5 +68,5 @@ def _pure(v: Float[Array, "3"]) -> Float[Array, "4"]:
 
 
 def _product(A: Float[Array, "i j"], B: Float[Array, "j k"]) -> Float[Array, "i k"]:
-    """Multiply matrices as a sum, which fuses with what is around it."""
+    """Multiply matrices as a sum, which fuses with the surrounding operations."""
     return jnp.sum(A[:, :, None] * B[None, :, :], axis=1)

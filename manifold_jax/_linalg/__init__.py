@@ -1,1 +1,1 @@
-"""Dense, banded and sparse linear algebra, and the Newton iterations on it."""
+"""Dense, banded and sparse linear algebra, and Newton iterations."""

@@ -1,4 +1,4 @@
-"""Colors for derivatives along several unknowns at once (Curtis, Powell & Reid, J. Inst. Maths
+"""Graph colorings for derivatives along several unknowns at once (Curtis, Powell & Reid, J. Inst. Maths
 Applics 13 (1974) 117-119)."""
 
 import itertools
@@ -9,7 +9,7 @@ import scipy.sparse as sp
 
 
 def greedy_colors(conflict: Any, most_conflicts_first: bool = False) -> np.ndarray:
-    """The smallest color for each number that those in conflict with it do not have yet."""
+    """Return for each number the smallest color that no neighbour with a color yet has."""
     conflict = sp.csr_array(conflict + conflict.T)
     starts = conflict.indptr
     order = np.arange(len(starts) - 1)

@@ -24,18 +24,18 @@ UNROLL_LIMIT = 8
 
 
 class Factorization(eqx.Module):
-    """A square matrix, the factors with which its systems are solved, and whether its rank was full.
+    """A square matrix, the factors with which its systems are solved, and whether they are usable.
 
-    Where it was not the solution is finite but meaningless: its derivative must not be NaN, as
+    Where they are not, the solution is finite but meaningless: its derivative must not be NaN, as
     the zero cotangent of a rejected step would turn into NaN, too.
 
     The derivative is that of `A x = b`, not of the elimination: five times less to compile.
     """
 
     A: Float[Array, "m m"]
-    factors: Any  # with `solve` and `solve_transposed`, held fixed
-    full_rank: BoolScalar
-    product: Callable = eqx.field(static=True)  # of `A` and what it is solved for
+    factors: Any  # with `solve` and `solve_transposed`; held fixed
+    usable: BoolScalar  # full rank
+    product: Callable = eqx.field(static=True)  # multiplies `A` by a solution
 
     def solve(self, b: Float[Array, "m ..."]) -> Float[Array, "m ..."]:
         return jax.lax.custom_linear_solve(
@@ -92,23 +92,23 @@ class Inverse(eqx.Module):
     """The inverse of a matrix, or its pseudo-inverse."""
 
     inverse: Float[Array, "m m"]
-    full_rank: BoolScalar
+    usable: BoolScalar  # full rank; of a pseudo-inverse, which does not need it, finite
     product: Callable = eqx.field(static=True)
 
     def solve(self, b: Float[Array, "m ..."]) -> Float[Array, "m ..."]:
         return self.product(self.inverse, b)
 
 
-# Rows from which on the inverse pays.
+# Number of rows from which on the inverse is faster.
 _SMALLEST_INVERSE = 3
 
 
 def factorize_once(A: Float[Array, "m m"]) -> "Factorization | Inverse":
-    """Factor a matrix, for what is evaluated once in a step, or in a solve.
+    """Factor a matrix that is used once in a step or in a solve.
 
-    Small ones by Gauss-Jordan elimination without pivoting, the whole matrix in one array: fewer and
-    larger operations than those of [`factorize`][], of which a program is compiled in less time. At
-    stages that elimination is faster.
+    Small ones by Gauss-Jordan elimination without pivoting, on the whole matrix as one array: fewer and
+    larger operations than those of [`factorize`][], which compile faster. At stages `factorize` runs
+    faster.
     """
     if not _SMALLEST_INVERSE <= A.shape[0] <= UNROLL_LIMIT:
         return factorize(A)
@@ -117,7 +117,7 @@ def factorize_once(A: Float[Array, "m m"]) -> "Factorization | Inverse":
 
 @jax.custom_jvp
 def _invert(A: Float[Array, "m m"]) -> tuple[Float[Array, "m m"], BoolScalar]:
-    """And whether the rank was full, as in [`factorize`][]."""
+    """Return the inverse, and whether the rank was full, as in [`factorize`][]."""
     m = A.shape[0]
     rows, diagonal = jnp.arange(m), jnp.abs(jnp.diagonal(A))
     full_rank = jnp.asarray(True)
@@ -139,26 +139,26 @@ def _invert_jvp(primals, tangents):
 
 
 def rank_threshold(A: Float[Array, "m m"]) -> float:
-    """What pivots of an equilibrated matrix of full rank exceed."""
+    """Return the size that the pivots of an equilibrated matrix of full rank exceed."""
     return 10 * A.shape[0] * float(jnp.finfo(A.dtype).eps)
 
 
 def _product(A: Float[Array, "i j"], B: Float[Array, "j ..."]) -> Float[Array, "i ..."]:
-    """`A B`; small ones as a sum that fuses, as batched tiny `dot`s are slow."""
+    """Return `A B`; small products as sums that fuse, as batched tiny `dot`s are slow."""
     if A.shape[0] > UNROLL_LIMIT:
         return jnp.tensordot(A, B, axes=1)
     return jnp.sum(A.reshape(*A.shape, *(1,) * (B.ndim - 1)) * B[None], axis=1)
 
 
 def factorize(A: Float[Array, "m m"]) -> Factorization:
-    """Factor a regular matrix.
+    """Factor a nonsingular matrix.
 
     Small ones without pivoting: the matrices met here are `G V` with `V` close to `W^-1 G^T`, or mass
     matrices, hence close to symmetric positive definite.
 
-    The rank counts as full when every pivot exceeds `10 m eps` times its diagonal entry: for a
-    Gram matrix `A = G W^-1 G^T` that ratio is the squared sine of the angle between
-    one row of `G` and the span of those before it, and rounding leaves about `eps` of it.
+    The rank counts as full if every pivot exceeds `10 m eps` times its diagonal entry: for a Gram
+    matrix `A = G W^-1 G^T` that ratio is the squared sine of the angle between one row of `G` and the
+    span of those before it, and rounding leaves about `eps` of it.
     """
     m, fixed = A.shape[0], jax.lax.stop_gradient(A)
     if m > UNROLL_LIMIT:
@@ -177,17 +177,17 @@ def factorize(A: Float[Array, "m m"]) -> Factorization:
     return Factorization(A, WrittenOut(lu), full_rank, _product)
 
 
-# Equations that depend on each other on the manifold do so only nearly at a stage off it:
-# eigenvalues of `A` below this fraction of the largest count as zero.
-_DEPENDENT = 1e-4
+# Redundant equations depend on each other only nearly at a stage off the manifold: eigenvalues of `A`
+# below this fraction of the largest count as zero.
+DEPENDENCE_THRESHOLD = 1e-4
 
 
-def pseudo_invert(A: Float[Array, "m m"], dependent: Any = _DEPENDENT) -> Inverse:
-    """Return `A^+` of a symmetric positive semidefinite matrix with its diagonal scaled to one, so
-    that the units of equations do not decide which of them depend on others: for such equations the
-    solution of least norm, each unknown multiplied by the square root of its diagonal entry.
-    Eigenvalues below `dependent` times the largest count as zero. In the place of a full rank, which
-    is not asked for, it says whether the matrix was finite."""
+def pseudo_invert(A: Float[Array, "m m"], dependent: Any = DEPENDENCE_THRESHOLD) -> Inverse:
+    """Return the pseudo-inverse of a symmetric positive semidefinite matrix whose diagonal is scaled to
+    one, so that the units of equations do not decide which of them depend on others. For redundant
+    equations `solve` gives the solution of least norm, with each unknown multiplied by the square root
+    of its diagonal entry. Eigenvalues below `dependent` times the largest count as zero. Usable if the
+    matrix is finite, whatever its rank."""
     finite = jnp.all(jnp.isfinite(A))
     A = jnp.where(finite, A, jnp.eye(A.shape[0], dtype=A.dtype))
     diagonal = jax.lax.stop_gradient(jnp.diagonal(A))
@@ -199,8 +199,8 @@ def pseudo_invert(A: Float[Array, "m m"], dependent: Any = _DEPENDENT) -> Invers
 
 @ForwardRule
 def _pseudo_inverse(A: Float[Array, "m m"], dependent: FloatScalar) -> Float[Array, "m m"]:
-    """Return the pseudo-inverse of a symmetric matrix. (The derivative of `jnp.linalg.pinv` cannot
-    be differentiated again where `rtol` is an array.)"""
+    """Return the pseudo-inverse of a symmetric matrix. (The derivative of `jnp.linalg.pinv` cannot be
+    differentiated again if `rtol` is an array.)"""
     values, V = jnp.linalg.eigh(A, symmetrize_input=False)
     used = jnp.abs(values) > dependent * jnp.max(jnp.abs(values))
     return (V * jnp.where(used, 1 / jnp.where(used, values, 1), 0)[None, :]) @ V.T
@@ -208,7 +208,7 @@ def _pseudo_inverse(A: Float[Array, "m m"], dependent: FloatScalar) -> Float[Arr
 
 @_pseudo_inverse.define_jvp
 def _pseudo_inverse_jvp(P, primals, tangents):
-    """The derivative at constant rank (Golub & Pereyra 1973)."""
+    """Differentiate at constant rank (Golub & Pereyra 1973)."""
     (A, _), (A_dot, _) = primals, tangents
     one = jnp.eye(A.shape[0], dtype=A.dtype)
     turned = P @ P @ A_dot.T @ (one - A @ P)
@@ -216,9 +216,9 @@ def _pseudo_inverse_jvp(P, primals, tangents):
 
 
 def factorize_positive(A: Float[Array, "m m"]) -> Factorization:
-    """Factor a symmetric matrix, whose rank counts as full if it is positive definite."""
+    """Factor a symmetric matrix; its rank counts as full if it is positive definite."""
     if A.shape[0] <= UNROLL_LIMIT:
-        return factorize(A)  # which wants positive pivots
+        return factorize(A)  # requires positive pivots, too
     lower = jnp.linalg.cholesky(_equilibrated(A))
     positive = jnp.all(jnp.diagonal(lower) ** 2 > rank_threshold(A))  # NaN unless positive definite
     return _factorize_by_library(A, positive)
@@ -236,15 +236,15 @@ def _factorize_by_library(A: Float[Array, "m m"], full_rank: BoolScalar) -> Fact
 
 
 def gram(A: Float[Array, "i n"], B: Float[Array, "k n"]) -> Float[Array, "i k"]:
-    """`A B^T`; small ones as a sum that fuses, as batched tiny `dot`s are slow."""
+    """Return `A B^T`; small products as sums that fuse, as batched tiny `dot`s are slow."""
     if max(A.shape[0], B.shape[0]) > UNROLL_LIMIT:
         return A @ B.T
     return jnp.sum(A[:, None, :] * B[None, :, :], axis=2)
 
 
 def gram_written_out(A: Float[Array, "i n"], B: Float[Array, "k n"]) -> Float[Array, "i k"]:
-    """`A B^T` for what is evaluated at every stage: more to compile, but without the reductions
-    for which XLA calls a library if the batch is large, and which then do not fuse."""
+    """Return `A B^T` for use at every stage: takes longer to compile, but has no reductions, for which
+    XLA calls a library if the batch is large, and which then do not fuse."""
     if max(*A.shape, B.shape[0]) > UNROLL_LIMIT:
         return gram(A, B)
     return sum(A[:, None, j] * B[None, :, j] for j in range(A.shape[1]))  # pyright: ignore[reportReturnType]

@@ -1,4 +1,4 @@
-"""Newton's method for as many equations as unknowns, and the derivative of their root.
+"""Newton's method for square systems, and the derivative of their roots.
 
 `r(z) = residual(point(z))` with unknowns `z` and the point to which they belong. Vectors only.
 """
@@ -27,11 +27,11 @@ class Linearization(Protocol):
 
 
 class AbstractEquations(eqx.Module):
-    """`m` equations in `m` unknowns. All that a root depends on are leaves."""
+    """`m` equations in `m` unknowns. All arrays that a root depends on are leaves."""
 
     @abc.abstractmethod
     def point(self, z: Float[Array, " m"]) -> Float[Array, " n"]:
-        """Where the unknowns lead."""
+        """Return the point that belongs to the unknowns."""
 
     @abc.abstractmethod
     def residual(self, x: Float[Array, " n"]) -> Float[Array, " m"]:
@@ -39,12 +39,11 @@ class AbstractEquations(eqx.Module):
 
     @abc.abstractmethod
     def linearize(self, x: Float[Array, " n"]) -> Linearization:
-        """The derivative of the residual with respect to the unknowns, at a point."""
+        """Return the derivative of the residual with respect to the unknowns, at a point."""
 
 
 class SquareSystem(AbstractEquations):
-    """`function(z) = 0` of vectors, with its matrix `dr/dz` if there is a shorter way to it. Both are
-    pytrees of all that they depend on."""
+    """`function(z) = 0` for vectors, optionally with its matrix `dr/dz`, both pytrees."""
 
     function: Callable
     matrix: Callable | None = None
@@ -61,46 +60,46 @@ class SquareSystem(AbstractEquations):
 
 
 class Iterate(NamedTuple):
-    """Unknowns, their residual, its largest scaled component, and how it went."""
+    """The unknowns, their residual, and the state of the iteration."""
 
     z: Float[Array, " m"]
     r: Float[Array, " m"]
-    level: FloatScalar  # max_i |r_i| / scale_i
+    scaled_residual: FloatScalar  # max_i |r_i| / scale_i
     iterations: IntScalar
     progress: BoolScalar  # whether the last iteration lowered the residual
 
 
 class _Search(NamedTuple):
-    """Equations with the typical sizes by which their residuals are measured."""
+    """Equations with the scale of each residual."""
 
     equations: AbstractEquations
     scale: Float[Array, " m"]
 
     def at(self, z: Float[Array, " m"]) -> tuple[Float[Array, " m"], FloatScalar]:
         r = self.equations.residual(self.equations.point(z))
-        return r, self.level(r)
+        return r, self.scaled(r)
 
-    def level(self, r: Float[Array, " m"]) -> FloatScalar:
+    def scaled(self, r: Float[Array, " m"]) -> FloatScalar:
         return jnp.max(jnp.abs(r) / self.scale)
 
     def lowered(self, state: Iterate, dz: Float[Array, " m"]) -> Iterate:
-        """The step `z - dz` if it lowers the residual, else the state as it was."""
+        """Return the step to `z - dz` if it lowers the residual, else the state as it was."""
         z = state.z - dz
-        r, level = self.at(z)
-        progress = level < state.level
+        r, scaled_residual = self.at(z)
+        progress = scaled_residual < state.scaled_residual
         best = jtu.tree_map(
-            lambda new, old: jnp.where(progress, new, old), (z, r, level), state[:3]
+            lambda new, old: jnp.where(progress, new, old), (z, r, scaled_residual), state[:3]
         )
         return Iterate(*best, state.iterations + 1, progress)  # pyright: ignore[reportCallIssue]
 
 
-# Scaled residual, in rounding units, at which nothing more can be gained. At 4 units the
-# circle of the paper's Example 2.1 is left by up to 1.8e-15, at half a unit by 4.4e-16.
+# Scaled residual, in units of rounding, at which iterations end. With 4 units the circle of the paper's
+# Example 2.1 is left by up to 1.8e-15, with half a unit by 4.4e-16.
 _ROUNDING = 0.5
 
 
-# Equations up to which iterations are written out. With more of them the loop runs as fast and
-# compiles in less time.
+# Largest number of equations for which iterations are written out. For more of them the loop runs as
+# fast and compiles in less time.
 _WRITTEN_OUT = 2
 
 
@@ -112,24 +111,25 @@ def chord(
     scale: Float[Array, " m"],
     max_steps: int,
 ) -> Iterate:
-    """Simplified Newton from `z` with residual `r`: one factorization throughout. Two iterations
-    are nearly always enough, and for few equations are written out, so that they fuse with what is
-    around them.
+    """Simplified Newton iteration from `z` with residual `r`, with a single factorization. Two
+    iterations are nearly always enough; for few equations they are written out, so that they fuse with
+    the surrounding operations.
 
-    A point that is a root to rounding stays where it is: a correction of that size is
-    large for a component that is small."""
+    A point that is a root to rounding stays where it is: a correction of that size is large for a
+    component that is small.
+    """
     search = _Search(equations, scale)
     written_out = min(2, max_steps) if r.size <= _WRITTEN_OUT else 0
     rounding = _ROUNDING * jnp.finfo(r.dtype).eps
-    level = search.level(r)
-    needed = level > rounding
+    scaled_residual = search.scaled(r)
+    needed = scaled_residual > rounding
     for _ in range(written_out):
         z = jnp.where(needed, z - linearization.solve(r), z)
-        r, level = search.at(z)
+        r, scaled_residual = search.at(z)
     return jax.lax.while_loop(
-        lambda s: (s.level > rounding) & s.progress & (s.iterations < max_steps),
+        lambda s: (s.scaled_residual > rounding) & s.progress & (s.iterations < max_steps),
         lambda s: search.lowered(s, linearization.solve(s.r)),
-        Iterate(z, r, level, jnp.asarray(written_out, jnp.int32), jnp.asarray(True)),
+        Iterate(z, r, scaled_residual, jnp.asarray(written_out, jnp.int32), jnp.asarray(True)),
     )
 
 
@@ -141,14 +141,14 @@ def damped_newton(
     max_steps: int,
     tolerance: Any,
 ) -> Iterate:
-    """A new Jacobian in every iteration, and a quarter of the step while the residual grows,
-    unless it is below `tolerance` already."""
+    """Newton's method with a new Jacobian in every iteration, and a quarter of the step while the
+    residual grows, unless it is below `tolerance` already."""
     search = _Search(equations, scale)
 
     def unfinished(carry: tuple[Iterate, FloatScalar]) -> BoolScalar:
         s, _ = carry
-        stalled = ~s.progress & (s.level <= tolerance)
-        rounded = s.level <= _ROUNDING * jnp.finfo(r.dtype).eps
+        stalled = ~s.progress & (s.scaled_residual <= tolerance)
+        rounded = s.scaled_residual <= _ROUNDING * jnp.finfo(r.dtype).eps
         return ~rounded & ~stalled & (s.iterations < max_steps)
 
     def advance(carry: tuple[Iterate, FloatScalar]) -> tuple[Iterate, FloatScalar]:
@@ -157,8 +157,8 @@ def damped_newton(
         s = search.lowered(s, damping * dz)
         return s, jnp.where(s.progress, jnp.ones_like(damping), damping / 4)
 
-    start = Iterate(z, r, search.level(r), jnp.zeros((), jnp.int32), jnp.asarray(True))
-    return jax.lax.while_loop(unfinished, advance, (start, jnp.ones_like(start.level)))[0]
+    start = Iterate(z, r, search.scaled(r), jnp.zeros((), jnp.int32), jnp.asarray(True))
+    return jax.lax.while_loop(unfinished, advance, (start, jnp.ones_like(start.scaled_residual)))[0]
 
 
 def find_root(
@@ -167,16 +167,15 @@ def find_root(
     max_steps: int = 50,
     tolerance: Any = jnp.inf,
 ) -> Float[Array, " m"]:
-    """The best unknowns found, by `max_i |r_i|`, without their derivative. Simple roots are found
-    to round-off. Ends where no step lowers a residual that is below the tolerance."""
+    """Return the best unknowns found, by `max_i |r_i|`, without their derivative. Simple roots are
+    found to rounding. Ends where no step lowers a residual that is below the tolerance."""
     equations, guess = without_derivative((equations, guess))
     r = equations.residual(equations.point(guess))
     return damped_newton(equations, guess, r, jnp.ones_like(r), max_steps, tolerance).z
 
 
 class ImplicitTangent(NamedTuple):
-    """How a root moves: `dz`, how the point would move with the unknowns held fixed, and the
-    derivatives there."""
+    """Tangents of a root and of its point at fixed unknowns, and the linearization at the root."""
 
     dz: Float[Array, " m"]
     moved: Float[Array, " n"]
@@ -186,11 +185,11 @@ class ImplicitTangent(NamedTuple):
 def implicit_tangent(
     equations: AbstractEquations, tangent: Any, z: Float[Array, " m"]
 ) -> ImplicitTangent:
-    """The derivative of the root `z` along `tangent`, that of the leaves of `equations`:
+    """Return the derivative of the root `z` along `tangent`, a tangent of the leaves of `equations`:
 
         r(z, theta) = 0:  dz = -(dr/dz)^-1 (dr/dtheta) dtheta.
 
-    How the root was found does not matter. Can itself be differentiated.
+    It does not depend on how the root was found, and can itself be differentiated.
     """
     point, moved = _derivative(lambda e: e.point(z), equations, tangent)
     along = lambda both: both[0].residual(both[1])
@@ -206,7 +205,7 @@ def _derivative(f: Callable, x: Any, tangent: Any) -> tuple[Array, Array]:
 
 @ForwardRule
 def implicit_root(equations: AbstractEquations, root: Float[Array, " m"]) -> Float[Array, " m"]:
-    """`root` itself, as the function of the leaves of `equations` that they define."""
+    """Return `root` as a function of the leaves of `equations`, which define it."""
     del equations
     return root
 
@@ -219,8 +218,8 @@ def _implicit_root_jvp(root, primals, tangents):
 
 @ForwardRule
 def root_of_step(step: Callable[[Array], Array], root: Array) -> Array:
-    """`root` itself, as the function of the leaves of `step` that they define: `step(x)` is Newton's
-    step `-A^-1 r` at `x`, of which the derivative at a root is that of the root."""
+    """Return `root` as a function of the leaves of `step`: `step(x)` is Newton's step `-A^-1 r` at `x`,
+    whose derivative at a root is that of the root."""
     del step
     return root
 
@@ -232,5 +231,5 @@ def _root_of_step_jvp(root, primals, tangents):
 
 
 def without_derivative(tree: Any) -> Any:
-    """`tree` with all its arrays held fixed."""
+    """Return `tree` with all its arrays held fixed."""
     return jtu.tree_map(lambda x: jax.lax.stop_gradient(x) if eqx.is_inexact_array(x) else x, tree)

@@ -1,4 +1,4 @@
-"""Linear systems with any regular matrix, factored once and solved for several right-hand sides."""
+"""Linear systems with any nonsingular matrix, factored once and solved for several right-hand sides."""
 
 from collections.abc import Callable
 from typing import Any
@@ -14,18 +14,17 @@ from .dense import Factorization, Library, rank_threshold, UNROLL_LIMIT
 from .rows import combine, multiply
 
 
-# Rows up to which an elimination is written out entry by entry, for XLA to fuse it with the stages. A
-# step of Rodas5P for three (four) numbers then takes 0.2 (0.3) of the time with LAPACK, in batches
-# too; for six 1.4 times as long, and it compiles in twice the time. jaxlib 0.10.2.
+# Largest number of rows for which an elimination is written out entry by entry, so that XLA fuses it
+# with the stages. A step of Rodas5P for three (four) unknowns then takes 0.2 (0.3) of the time with
+# LAPACK, in batches too; for six 1.4 times as long, and it compiles in twice the time. jaxlib 0.10.2.
 LARGEST_WRITTEN_OUT = 4
 
-# Columns up to which the elimination of a whole array is.
+# Largest number of columns for which the loop of `reduction` is unrolled.
 _UNROLLED_COLUMNS = 4
 
 
 class UnrolledElimination(eqx.Module):
-    """`E A = U`, upper triangular, with the inverses of the pivots on the diagonal. No row exchange is
-    left for the right-hand sides."""
+    """`E A = U`, upper triangular, with inverse pivots on its diagonal. `E` has the row exchanges."""
 
     U: list[list[FloatScalar]]
     E: Float[Array, "n n"]
@@ -51,27 +50,27 @@ class UnrolledElimination(eqx.Module):
 def factorize_pivoted(
     A: Float[Array, "n n"], largest_written_out: int = LARGEST_WRITTEN_OUT
 ) -> Factorization:
-    """Factor any matrix with row exchanges; one that is singular or not finite is replaced."""
+    """Factor any matrix with row exchanges; one that is singular or not finite becomes the identity."""
     fixed, eye = jax.lax.stop_gradient(A), jnp.eye(A.shape[0], dtype=A.dtype)
-    factors, regular = (_eliminate if A.shape[0] <= largest_written_out else _lapack)(fixed)
-    return Factorization(jnp.where(regular, A, eye), factors, regular, multiply)
+    factors, nonsingular = (_eliminate if A.shape[0] <= largest_written_out else _lapack)(fixed)
+    return Factorization(jnp.where(nonsingular, A, eye), factors, nonsingular, multiply)
 
 
 def _lapack(A: Float[Array, "n n"]) -> tuple[Library, BoolScalar]:
     lu, pivots = jsl.lu_factor(A)
-    regular = jnp.all(jnp.isfinite(lu)) & jnp.all(jnp.diagonal(lu) != 0)
-    lu = jnp.where(regular, lu, jnp.eye(A.shape[0], dtype=A.dtype))
-    pivots = jnp.where(regular, pivots, jnp.arange(A.shape[0], dtype=pivots.dtype))
-    return Library((lu, pivots)), regular
+    nonsingular = jnp.all(jnp.isfinite(lu)) & jnp.all(jnp.diagonal(lu) != 0)
+    lu = jnp.where(nonsingular, lu, jnp.eye(A.shape[0], dtype=A.dtype))
+    pivots = jnp.where(nonsingular, pivots, jnp.arange(A.shape[0], dtype=pivots.dtype))
+    return Library((lu, pivots)), nonsingular
 
 
 def _eliminate(A: Float[Array, "n n"]) -> tuple[UnrolledElimination, BoolScalar]:
-    """The largest entry of a column becomes its pivot by exchanges of two rows each, which need no
-    index that is known only while running."""
+    """Eliminate with partial pivoting. The largest entry of a column is brought to the pivot by
+    comparing and exchanging pairs of rows, without indices that are known only at run time."""
     n = A.shape[0]
     eye = jnp.eye(n, dtype=A.dtype)
     rows: list[list[Any]] = [list(A[i]) + list(eye[i]) for i in range(n)]
-    regular = jnp.asarray(True)
+    nonsingular = jnp.asarray(True)
     for k in range(n):
         for i in range(k + 1, n):
             larger = jnp.abs(rows[i][k]) > jnp.abs(rows[k][k])
@@ -80,20 +79,20 @@ def _eliminate(A: Float[Array, "n n"]) -> tuple[UnrolledElimination, BoolScalar]
                 rows[k][j], rows[i][j] = jnp.where(larger, b, a), jnp.where(larger, a, b)
         pivot = rows[k][k]
         accepted = (pivot != 0) & jnp.isfinite(pivot)
-        regular &= accepted
+        nonsingular &= accepted
         rows[k][k] = 1 / jnp.where(accepted, pivot, 1)
         for i in range(k + 1, n):
             factor = rows[i][k] * rows[k][k]
             for j in range(k + 1, 2 * n):
                 rows[i][j] = rows[i][j] - factor * rows[k][j]
-    # Of a singular matrix that of the identity.
-    U = [[jnp.where(regular, rows[i][j], float(i == j)) for j in range(n)] for i in range(n)]
-    E = jnp.where(regular, jnp.stack([jnp.stack(row[n:]) for row in rows]), eye)
-    return UnrolledElimination(U, E), regular
+    # A singular matrix is replaced by the identity.
+    U = [[jnp.where(nonsingular, rows[i][j], float(i == j)) for j in range(n)] for i in range(n)]
+    E = jnp.where(nonsingular, jnp.stack([jnp.stack(row[n:]) for row in rows]), eye)
+    return UnrolledElimination(U, E), nonsingular
 
 
 class InverseFactor(eqx.Module):
-    """`A^-1` itself."""
+    """The inverse `A^-1`."""
 
     inverse: Float[Array, "n n"]
     product: Callable = eqx.field(static=True)
@@ -106,7 +105,7 @@ class InverseFactor(eqx.Module):
 
 
 class Equilibrated(eqx.Module):
-    """The factors of `A` with rows and columns that were multiplied by these numbers."""
+    """The factors of `A` after scaling its rows and columns by these numbers."""
 
     rows: Float[Array, " n"]
     columns: Float[Array, " n"]
@@ -120,8 +119,8 @@ class Equilibrated(eqx.Module):
 
 
 def factorize_equilibrated(A: Float[Array, "n n"]) -> Factorization:
-    """Factor any matrix with row exchanges, whatever the units of equations and unknowns. Where its
-    rank is not full solutions need not be finite."""
+    """Factor any matrix with row exchanges, whatever the units of equations and unknowns. Solutions
+    need not be finite if the rank is not full."""
     fixed, threshold = jax.lax.stop_gradient(A), rank_threshold(A)
     one = lambda size: jnp.where(size > 0, 1 / jnp.where(size > 0, size, 1), 1)
     rows = one(jnp.max(jnp.abs(fixed), axis=1))
@@ -129,7 +128,7 @@ def factorize_equilibrated(A: Float[Array, "n n"]) -> Factorization:
     scaled = fixed * rows[:, None] * columns[None, :]
     if A.shape[0] <= UNROLL_LIMIT:
         factors = InverseFactor(reduction(scaled)[0], multiply)
-        full_rank = jnp.max(jnp.abs(factors.inverse)) * threshold < 1  # not so of NaN
+        full_rank = jnp.max(jnp.abs(factors.inverse)) * threshold < 1  # false for NaN
     else:
         factors = Library(jsl.lu_factor(scaled))
         full_rank = jnp.all(jnp.abs(jnp.diagonal(factors.lu[0])) > threshold)
@@ -137,18 +136,18 @@ def factorize_equilibrated(A: Float[Array, "n n"]) -> Factorization:
 
 
 def factorize_by_reduction(A: Float[Array, "n n"]) -> Factorization:
-    """Factor any matrix with row exchanges, without LAPACK. Not finite if it is singular."""
+    """Factor any matrix with row exchanges, without LAPACK. The result is not finite if it is singular."""
     E, _ = reduction(jax.lax.stop_gradient(A))
     return Factorization(A, InverseFactor(E, jnp.matmul), jnp.all(jnp.isfinite(E)), jnp.matmul)
 
 
 def reduction(A: Float[Array, "n k"]) -> tuple[Float[Array, "n n"], FloatScalar]:
-    """`E` with `E A = 1` (or `[1; 0]` if `k < n`) and the sign of `det E`, by Gauss-Jordan
-    elimination with row exchanges. Not finite if the columns of `A` are dependent.
+    """Return `E` with `E A = 1` (or `[1; 0]` if `k < n`) and the sign of `det E`, by Gauss-Jordan
+    elimination with row exchanges. The result is not finite if the columns of `A` are dependent.
 
-    Without LAPACK: batched factorizations can wait for each other for ever on the CPU. Seen with
-    jaxlib 0.10.2 on two cores: two that do not depend on each other, under `vmap` in one large
-    program, each held a thread of XLA's pool and waited there for tasks in the queue of the pool.
+    Without LAPACK: batched factorizations can deadlock on the CPU. Seen with jaxlib 0.10.2 on two
+    cores: two independent ones under `vmap` in one large program each held a thread of XLA's pool and
+    waited there for tasks in the queue of the pool.
     """
     n, k = A.shape
     rows = jnp.arange(n)

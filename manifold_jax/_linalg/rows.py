@@ -1,4 +1,4 @@
-"""Rows of a matrix: an array, or products with them alone."""
+"""The rows of a matrix: an array, or a linear map without its entries."""
 
 import abc
 from typing import Any, Protocol, runtime_checkable, TYPE_CHECKING, TypeAlias
@@ -12,13 +12,13 @@ from .dense import gram, UNROLL_LIMIT
 
 @runtime_checkable
 class Metric(Protocol):
-    """A symmetric matrix `W` that can be solved with."""
+    """A symmetric matrix `W` with a method that solves its systems."""
 
     def solve(self, rows: Float[Array, "*k n"]) -> Float[Array, "*k n"]: ...
 
 
 class AbstractRows(eqx.Module):
-    """Rows `C` of shape `(m, n)` that are not held as an array, for the functions below."""
+    """Rows `C` of shape `(m, n)` that are not held as an array."""
 
     @abc.abstractmethod
     def multiply(self, x: Float[Array, " n"]) -> Float[Array, " m"]:
@@ -38,12 +38,12 @@ class AbstractRows(eqx.Module):
 
     @abc.abstractmethod
     def factorize(self, directions: "AbstractRows", checked: bool = True) -> Any:
-        """`C V` with the rows of `V^T`, factored: `solve(b)`, and `full_rank`. That is not known if
-        it is not checked; then look at the residuals of solutions, `solves(residual, size2)`."""
+        """Factor `C V`, given the rows of `V^T`. The result has `solve(b)` and `usable`. Unless it is
+        `checked`, test residuals of solutions instead with its `solves(residual, size2)`."""
 
     @abc.abstractmethod
     def of_other(self, function: Any, t: Array, x: Float[Array, " n"], args: Any) -> "AbstractRows":
-        """Those of `function(t, x, args)` at `x`, of the same structure."""
+        """Return the rows for `function(t, x, args)` at `x`, which has the same structure."""
 
 
 class InverseWeights(eqx.Module):
@@ -56,13 +56,13 @@ class InverseWeights(eqx.Module):
 
 
 if TYPE_CHECKING:
-    Rows: TypeAlias = Any  # whoever knows that they are an array uses them as one
+    Rows: TypeAlias = Any  # code that knows that rows are an array uses them as one
 else:
     Rows: TypeAlias = Float[Array, "_ _"] | AbstractRows
 
 
 def directions_of(metric: Metric, C: Rows) -> Rows:
-    """The rows of `V^T = C W^-1`."""
+    """Return the rows of `V^T = C W^-1`."""
     return C.along(metric) if isinstance(C, AbstractRows) else metric.solve(C)
 
 
@@ -76,7 +76,7 @@ def combine(weights: Float[Array, " m"], rows: Rows) -> Float[Array, " n"]:
 
 
 def multiply(A: Rows, x: Float[Array, " n"]) -> Float[Array, " m"]:
-    """`A x`, not by the library either, whose batched small products are slow."""
+    """Return `A x`, without the library for small `A`, whose batched small products are slow."""
     if isinstance(A, AbstractRows):
         return A.multiply(x)
     if A.shape[1] > UNROLL_LIMIT:
@@ -85,7 +85,7 @@ def multiply(A: Rows, x: Float[Array, " n"]) -> Float[Array, " m"]:
 
 
 def product(M: Float[Array, "..."], v: Float[Array, " n"]) -> Float[Array, " n"]:
-    """`M v` of a scalar, a diagonal, a matrix, or of the blocks `(b, d, d)` on its diagonal."""
+    """Return `M v` for a scalar, a diagonal, a matrix, or the blocks `(b, d, d)` on its diagonal."""
     if M.ndim < 2:
         return M * v
     if M.ndim == 2:

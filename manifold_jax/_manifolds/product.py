@@ -1,4 +1,4 @@
-"""Manifolds of which the state is made, part by part."""
+"""Products of manifolds, one for each part of the state."""
 
 from typing import Any
 

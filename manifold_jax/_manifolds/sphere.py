@@ -1,4 +1,4 @@
-"""Spheres, and everything of a fixed length: unit vectors and quaternions."""
+"""Spheres: unit vectors, quaternions and other states of a fixed length."""
 
 import functools
 from typing import Any, ClassVar
@@ -48,13 +48,12 @@ class Sphere(mj.AbstractConstraint):
             )
         square, target = _square(y), self.radius**2
         success = jnp.isfinite(square) & (square > 0)
-        # Replaced where it fails before anything is computed with it: the derivative of a NaN is
-        # never zero.
+        # Replaced where it fails before anything is computed: the derivative of a NaN is never zero.
         fallback = jax.lax.stop_gradient(y if fallback is None else fallback)
         x = jtu.tree_map(lambda a, b: jnp.where(success, a, b), y, fallback)
         size = _square(x)
         scale = self.radius / jnp.sqrt(jnp.where(size > 0, size, 1))
-        # On the sphere to rounding already the point stays as it is, but not its derivative.
+        # A point on the sphere to rounding stays as it is, but its derivative does not.
         there = jnp.abs(size - target) <= 2 * jnp.finfo(square.dtype).eps * target
         scale = jnp.where(there, scale + jax.lax.stop_gradient(1 - scale), scale)
         moved = jtu.tree_map(lambda a: scale.astype(a.dtype) * a, x)

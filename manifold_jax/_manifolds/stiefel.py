@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 import manifold_jax as mj
 
 
-# Off the manifold: squares of singular values within 1/2 of 1 have converged after 4 iterations.
+# Near the manifold: with squares of singular values within 1/2 of 1, 4 iterations converge.
 _CONVERGES, _NEAR = 0.5, 4
 # From anywhere: the smallest singular value grows by 1.875 at first, 1e-12 of the largest needs 44.
 _FAR = 52
@@ -65,7 +65,7 @@ class Stiefel(mj.AbstractConstraint):
         # Replaced where it fails before it is differentiated: iterations that diverge overflow.
         x = jnp.where(success, y, safe)
         p = polar(x)
-        # On the manifold to rounding already the point stays as it is, but not its derivative.
+        # A point on the manifold to rounding stays as it is, but its derivative does not.
         there = self._residual(x) <= 2 * jnp.finfo(y.dtype).eps
         p = jnp.where(success, jnp.where(there, p + jax.lax.stop_gradient(x - p), p), y)
         residual = jnp.where(finite, self._residual(jax.lax.stop_gradient(p)), jnp.nan)
@@ -82,7 +82,7 @@ def _polar(Y: Float[Array, "n k"]) -> Float[Array, "n k"]:
 
 
 def _polar_from_anywhere(Y: Float[Array, "n k"]) -> Float[Array, "n k"]:
-    size = jnp.sqrt(jnp.sum(jnp.square(Y)))  # on which the polar factor does not depend
+    size = jnp.sqrt(jnp.sum(jnp.square(Y)))  # the polar factor does not depend on it
     Y = Y / jax.lax.stop_gradient(jnp.where(size > 0, size, 1))
     return jax.lax.scan(lambda Y, _: (_improved(Y), None), Y, length=_FAR)[0]
 
@@ -98,7 +98,7 @@ def _gram(Y: Float[Array, "n k"]) -> Float[Array, "k k"]:
 
 
 def _product(A: Float[Array, "i j"], B: Float[Array, "j l"]) -> Float[Array, "i l"]:
-    """Small ones as sums, which fuse with what is around them."""
+    """Multiply small matrices as sums, which fuse with the surrounding operations."""
     if max(*A.shape, B.shape[1]) > 8:
         return A @ B
     return jnp.sum(A[:, :, None] * B[None, :, :], axis=1)

@@ -18,10 +18,10 @@ from .constraint import MechanicalConstraint, whole_structure
 
 class ExtendedConstraint(AbstractConstraint):
     """The constraints of a [`MechanicalSystem`][] on its state `(q, v, z)`: those of the motion
-    `(q, v)`, and of the auxiliary states `z` alone, if they have any.
+    `(q, v)`, and those of the auxiliary states `z` alone, if there are any.
 
-    Built by `MechanicalSystem.constraint`. Both are corrected by themselves. ConstraintNormals are
-    those of the motion: in local coordinates `z` is corrected along its own.
+    Built by `MechanicalSystem.constraint`. Both are corrected separately. The normals are those of the
+    motion: in local coordinates `z` is corrected along its own.
     """
 
     motion: MechanicalConstraint
@@ -72,7 +72,7 @@ class ExtendedConstraint(AbstractConstraint):
 
 
 def split(y: Y) -> tuple[tuple[Y, Y], Y]:
-    """`(q, v)` and `z`. Refuses, while tracing, states that are not `(q, v, z)`."""
+    """Return `(q, v)` and `z`. Refuse, while tracing, states that are not `(q, v, z)`."""
     if not (isinstance(y, tuple) and len(y) == 3):
         raise ValueError(
             "`y` must be the tuple `(q, v, z)` of positions, velocities and the auxiliary states of a mechanical "
@@ -83,12 +83,11 @@ def split(y: Y) -> tuple[tuple[Y, Y], Y]:
 
 
 def _projections(projection: NewtonProjection, y: Y) -> tuple[NewtonProjection, NewtonProjection]:
-    """Return the projections of the motion and of the auxiliary states, each with its part of the
-    metric."""
+    """Return the projections of motion and auxiliary states, each with its part of the metric."""
     if projection.metric is None or isinstance(projection.metric, str):
         return projection, projection
     if jtu.tree_structure(projection.metric) != jtu.tree_structure(y):
-        projection.inverse_metric(y)  # says so
+        projection.inverse_metric(y)  # raises
     of_part = lambda metric: dataclasses.replace(projection, metric=metric)
     motion, z = split(projection.metric)
     return of_part(motion), of_part(z)

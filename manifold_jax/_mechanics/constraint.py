@@ -15,7 +15,7 @@ from .._constraint.projection_info import ProjectionInfo
 from .._constraint.residual import as_time, residual_vector
 from .._linalg.rows import multiply
 from .._linalg.sparse import Choice, Structure, structure_of
-from .correction import InverseMetrics, TwoStages
+from .correction import InverseMetrics, PositionVelocityCorrection
 from .kinematics import flat, Kinematics
 
 
@@ -34,7 +34,7 @@ class MechanicalConstraint(AbstractConstraint):
 
     Built by `MechanicalSystem.constraint`. Corrections use its structure: first the positions,
     then the velocities, which is a linear problem, with the same matrix. The derivative of
-    `J v` is never formed. ConstraintNormals are those of the velocities.
+    `J v` is never formed. The normals are those of the velocities.
     """
 
     holonomic: Callable | None
@@ -55,14 +55,16 @@ class MechanicalConstraint(AbstractConstraint):
         x, _ = jfu.ravel_pytree(y)
         here = Kinematics.of(self, t, y, args)
         here = here if directions is None else here.dense()
-        stages = TwoStages(here, projection, InverseMetrics.of(projection, y), directions)
-        corrected, roots = stages.correct(fallback, far)
+        metrics = InverseMetrics.of(projection, y)
+        correction = PositionVelocityCorrection(here, projection, metrics, directions)
+        corrected, roots = correction.correct(fallback, far)
         return corrected, ProjectionInfo.of_correction(x, *roots)
 
     def normals(self, projection, t, y, args=None) -> ConstraintNormals:
         here = Kinematics.of(self, t, y, args).dense()
         metrics = InverseMetrics.of(projection, y)
-        return TwoStages(here, projection, metrics, None).normals(here.x, here.w).normals
+        correction = PositionVelocityCorrection(here, projection, metrics, None)
+        return correction.normals(here.x, here.w).normals
 
     def structure_at(self, t, y, args=None) -> Structure | None:
         return whole_structure(self, t, y, args) if self.is_sparse(t, y, args) else None
@@ -72,7 +74,7 @@ class MechanicalConstraint(AbstractConstraint):
         return Kinematics.of(self, t, y, args).structure_here() is not None
 
     def push_forward(self, t, y, args, directions, vector) -> Y:
-        """Positions first; the velocities depend on them."""
+        """Apply the derivative to the positions first; the velocities depend on them."""
         here, (e_x, e_w) = Kinematics.of(self, t, y, args), flat(vector)
         C, p = here.dense().rows()
         if p > 0:
@@ -92,7 +94,7 @@ class MechanicalConstraint(AbstractConstraint):
 def whole_structure(
     constraint: AbstractConstraint, t: RealScalarLike, y: Y, args: Args
 ) -> Structure | None:
-    """The structure of all equations with respect to the whole state, if they are sparse, too."""
+    """Return the structure of all equations with respect to the whole state, if they are sparse, too."""
     x, unravel = jfu.ravel_pytree(y)
     t = as_time(t, x.dtype)
     return structure_of(((lambda x: residual_vector(constraint, t, unravel(x), args), x),))

@@ -6,8 +6,7 @@ with `C` the Jacobian of all constraints with respect to the velocities, whose f
 `J = dphi/dq`, and one factorization of `C V` for both. The velocities are corrected at the
 corrected positions. Neither needs the derivative of `J v`, half of the full Jacobian.
 
-Source: Eich, SIAM J. Numer. Anal. 30 (1993) 1467-1482; Lubich, Nowak, Poehle & Engstler,
-MEXX (1992).
+Source: Eich, SIAM J. Numer. Anal. 30 (1993) 1467-1482; Lubich, Nowak, Poehle & Engstler, MEXX (1992).
 """
 
 import dataclasses
@@ -49,8 +48,8 @@ class InverseMetrics(NamedTuple):
         return InverseMetrics(diagonal[:k], diagonal[k:])
 
 
-class TwoStages(NamedTuple):
-    """How a state is corrected; `directions` are `V^T` if they are not those of the state itself."""
+class PositionVelocityCorrection(NamedTuple):
+    """The correction of a state; `directions` are `V^T` if they are not those of the state itself."""
 
     here: Kinematics
     projection: NewtonProjection
@@ -58,18 +57,18 @@ class TwoStages(NamedTuple):
     directions: Float[Array, "m k"] | None
 
     def correct(self, fallback: Y, far: bool) -> tuple[Y, tuple[CorrectionRoot, CorrectionRoot]]:
-        """The corrected state, and the roots for the positions and the velocities."""
+        """Return the corrected state, and the roots for the positions and the velocities."""
         x, w = self.here.x, self.here.w
         safe_x, safe_w = jax.lax.stop_gradient(flat(fallback))
-        # Replaced before anything is evaluated there: the derivative of a NaN is never zero.
+        # Replaced before any function is evaluated there: the derivative of a NaN is never zero.
         finite = jnp.all(jnp.isfinite(x)) & jnp.all(jnp.isfinite(w))
         x, w = jnp.where(finite, x, safe_x), jnp.where(finite, w, safe_w)
 
         factored, p = self._factored(x, w)
         positions = self._positions(x, safe_x, factored, p, far)
-        if far:  # the matrix at the corrected positions: the nearest velocities
+        if far:  # with the matrix at the corrected positions velocities move to the nearest ones
             factored, _ = self._factored(positions.p, w)
-        # Velocities are found by one iteration unless their equations are the user's.
+        # One iteration gives the velocities, unless a constraint on velocities is the user's.
         far = far and self.here.nonholonomic is not None
         context = positions.p, self.here.args
         velocities = self._solve(self.here.velocity, w, context, safe_w, factored, far)
@@ -93,8 +92,8 @@ class TwoStages(NamedTuple):
     def _factored(self, x: Float[Array, " k"], w: Float[Array, " k"]) -> tuple[FactoredGram, int]:
         normals, p, valid = self.normals(x, w)
         factored = FactoredGram.of(normals, self.here.system.redundant)
-        full_rank = factored.factorization.full_rank & valid
-        factorization = dataclasses.replace(factored.factorization, full_rank=full_rank)
+        usable = factored.factorization.usable & valid
+        factorization = dataclasses.replace(factored.factorization, usable=usable)
         return FactoredGram(normals, factorization), p
 
     def _positions(self, x, safe, factored: FactoredGram, p: int, far: bool) -> CorrectionRoot:
@@ -108,9 +107,9 @@ class TwoStages(NamedTuple):
     def _position_normals(self, x, normals: ConstraintNormals, p: int) -> ConstraintNormals:
         (C, directions), metrics = normals, self.metrics
         J = self.here._replace(x=x, w=x).position_rows(C, p)
-        if metrics is not None:  # one for positions of its own
+        if metrics is not None:  # positions have a metric of their own
             return ConstraintNormals(J, directions_of(InverseWeights(metrics.positions), J))
-        if isinstance(directions, SparseRows):  # `J` may have too few rows for that
+        if isinstance(directions, SparseRows):  # `J` may have too few rows to be sparse
             return ConstraintNormals(J, directions_of(directions.metric, J))  # pyright: ignore[reportArgumentType]
         return ConstraintNormals(J, directions[:p])
 
@@ -123,7 +122,7 @@ class TwoStages(NamedTuple):
 
 
 class MechanicalNormals(NamedTuple):
-    """The constraint normals with respect to the velocities; how many of the rows belong to
+    """The constraint normals with respect to the velocities, the number of their rows that belong to
     positions, and whether the mass matrix can be used."""
 
     normals: ConstraintNormals

@@ -22,7 +22,7 @@ Vector: TypeAlias = Float[Array, " k"]
 
 
 class AbstractPositions(eqx.Module):
-    """Constraints `phi(t, q, args)` that know a shorter way to their Jacobian than differentiating."""
+    """Constraints `phi(t, q, args)` with a faster way to their Jacobian than differentiation."""
 
     @abc.abstractmethod
     def __call__(self, t: RealScalarLike, q: Y, args: Args) -> Any: ...
@@ -34,7 +34,7 @@ class AbstractPositions(eqx.Module):
 
 class Kinematics(NamedTuple):
     """The constraints of a mechanical system at one state, as functions of vectors of `k` numbers, `x`
-    for positions and `w` for velocities; and its mass matrix there."""
+    for positions and `w` for velocities, and its mass matrix there."""
 
     system: Any  # or its constraint
     nonholonomic: Callable | None
@@ -53,7 +53,7 @@ class Kinematics(NamedTuple):
         return Kinematics(system, *fields, as_time(t, x.dtype), x, w, args)
 
     def dense(self) -> "Kinematics":
-        """The same, with Jacobians as arrays."""
+        """Return the same with Jacobians as arrays."""
         return self._replace(structure="dense")
 
     def position(self, t: Array, x: Vector, args: Args) -> Float[Array, " p"]:
@@ -62,7 +62,7 @@ class Kinematics(NamedTuple):
         return jfu.ravel_pytree(self.system.holonomic(t, self.unravel(x), args))[0]
 
     def velocity(self, t: Array, w: Vector, context: tuple[Vector, Args]) -> Float[Array, " m"]:
-        """Residual of the velocities at the positions in `context`."""
+        """Return the residual of the velocities at the positions in `context`."""
         x, args = context
         position = lambda t, x: self.position(t, x, args)
         _, rate = jax.jvp(position, (t, x), (jnp.ones_like(t), w))
@@ -82,12 +82,12 @@ class Kinematics(NamedTuple):
         return self.velocity(self.t, self.w, (self.x, self.args))
 
     def acceleration_bias(self) -> Float[Array, " m"]:
-        """What the second derivative of the constraints is at zero acceleration."""
+        """Return the second time derivative of the constraints at zero acceleration."""
         velocity = lambda t, x: self.velocity(t, self.w, (x, self.args))
         return jax.jvp(velocity, (self.t, self.x), (jnp.ones_like(self.t), self.w))[1]
 
     def rows(self) -> tuple[Rows, int]:
-        """`C = [J; da/dv]`, and how many of the rows belong to positions."""
+        """Return `C = [J; da/dv]`, and how many of its rows belong to positions."""
         t, x, w, args = self.t, self.x, self.w, self.args
         if (structure := self.structure_here()) is not None:
             p = jax.eval_shape(self.position, t, x, args).size
@@ -104,7 +104,7 @@ class Kinematics(NamedTuple):
         return jnp.concatenate([J, jacobian(nonholonomic, w)[1]]), J.shape[0]
 
     def position_rows(self, C: Rows, p: int) -> Rows:
-        """`J`, the first `p` of the rows `C`."""
+        """Return `J`, the first `p` of the rows `C`."""
         if isinstance(C, AbstractRows):
             return self._replace(nonholonomic=None).rows()[0]
         return C[:p]
@@ -130,7 +130,7 @@ class Kinematics(NamedTuple):
 
 
 def flat(y: Y) -> tuple[Vector, Vector]:
-    """Positions and velocities as vectors."""
+    """Return positions and velocities as vectors."""
     q, v = y
     return jfu.ravel_pytree(q)[0], jfu.ravel_pytree(v)[0]
 

@@ -1,4 +1,4 @@
-"""The mass matrix in its forms (scalar, diagonal, blocks, matrix), factored once per evaluation."""
+"""The mass matrix in its forms: scalar, diagonal, blocks or full matrix."""
 
 from collections.abc import Callable
 from typing import Any, ClassVar
@@ -18,7 +18,7 @@ from .._linalg.sparse import SparseRows
 
 
 class ConfigurationMass(eqx.Module):
-    """`M(q, args)` of the user, or a constant."""
+    """The user's `M(q, args)`, or a constant."""
 
     function: Callable | Any
 
@@ -40,7 +40,7 @@ class Mass(eqx.Module):
     """A factored mass matrix.
 
     - `diagonal`: scalar or `(n,)`; `None` for a matrix.
-    - `factorization`: of the matrix, to which `C^T D C` has been added; of blocks one each.
+    - `factorization`: of the matrix plus `C^T D C`; for blocks, one each.
     - `augmentation`: the diagonal of `D`, shape `(m,)`, or `None` for a diagonal.
     - `symmetric`, `positive`: whether the matrix can be used.
     """
@@ -56,10 +56,10 @@ class Mass(eqx.Module):
         return self.symmetric & self.positive
 
     def solve(self, rows: Float[Array, "*k n"]) -> Float[Array, "*k n"]:
-        """`M^-1` applied to each row."""
+        """Apply `M^-1` to each row."""
         if self.factorization is None:
             return rows / jnp.broadcast_to(self.diagonal, rows.shape)  # pyright: ignore[reportArgumentType]
-        if self.factorization.full_rank.ndim == 0:
+        if self.factorization.usable.ndim == 0:
             return self.factorization.solve(rows.T).T
         number, size = self.factorization.A.shape[:2]
         parts = jnp.moveaxis(rows.reshape(*rows.shape[:-1], number, size), -2, 0)
@@ -68,7 +68,7 @@ class Mass(eqx.Module):
 
 
 class InvertedBlocks(eqx.Module):
-    """A regular mass matrix of blocks whose inverses are known, where the matrix is expected."""
+    """A nonsingular mass matrix of blocks with known inverses, in the place of the matrix."""
 
     inverse: Float[Array, "b d d"]
     symmetric: BoolScalar
@@ -84,7 +84,7 @@ class InvertedBlocks(eqx.Module):
         return self.symmetric & self.positive
 
     def solve(self, rows: Float[Array, "*k n"]) -> Float[Array, "*k n"]:
-        """`M^-1` applied to each row."""
+        """Apply `M^-1` to each row."""
         number, size, _ = self.shape
         parts = rows.reshape(*rows.shape[:-1], number, 1, size)
         inverse = self.inverse.reshape(*(1,) * (rows.ndim - 1), number, size, size)
@@ -92,8 +92,8 @@ class InvertedBlocks(eqx.Module):
 
 
 def mass_values(mass_matrix: Any, q: Y) -> Float[Array, "..."] | InvertedBlocks:
-    """What `mass_matrix` returned as a scalar, a diagonal `(n,)`, a matrix `(n, n)` or its blocks
-    `(n / d, d, d)`."""
+    """Return the result of `mass_matrix` as a scalar, a diagonal `(n,)`, a matrix `(n, n)` or its
+    blocks `(n / d, d, d)`."""
     if isinstance(mass_matrix, InvertedBlocks):
         return mass_matrix
     x, _ = jfu.ravel_pytree(q)
@@ -101,7 +101,7 @@ def mass_values(mass_matrix: Any, q: Y) -> Float[Array, "..."] | InvertedBlocks:
     shape = jnp.shape(mass_matrix) if eqx.is_array_like(mass_matrix) else None
     if shape is not None and (shape in ((), (n,), (n, n)) or _is_blocks(shape, n)):
         return jnp.asarray(mass_matrix, x.dtype)
-    # Others are not spread: of masses of shape (2,) and q of shape (2, 2) nobody can say whether
+    # Others are not broadcast: for masses of shape (2,) and q of shape (2, 2) it is unknown whether
     # they belong to two bodies or to two coordinates.
     if jtu.tree_structure(mass_matrix) == jtu.tree_structure(q):
         pairs = zip(jtu.tree_leaves(mass_matrix), jtu.tree_leaves(q), strict=True)
@@ -117,13 +117,13 @@ def mass_values(mass_matrix: Any, q: Y) -> Float[Array, "..."] | InvertedBlocks:
 
 
 def factorize_mass(M: Float[Array, "..."] | InvertedBlocks, C: Rows) -> Mass | InvertedBlocks:
-    """Factor `M`, of one of the forms of `mass_values`, under constraints `C a = b`.
+    """Factor `M`, in one of the forms of `mass_values`, under constraints `C a = b`.
 
-    A singular matrix is allowed if it is positive definite on the null space of `C`, that is
-    if the matrix `[[M, C^T], [C, 0]]` is regular: then `M + C^T D C` is positive definite for
-    every `D > 0` and has the same accelerations (augmented Lagrangian; Benzi, Golub & Liesen,
-    Acta Numerica 14 (2005) 1-137, section 5). It is taken for regular ones, too: to look first
-    takes two factorizations in every program.
+    A singular matrix is allowed if it is positive definite on the null space of `C`, that is, if the
+    matrix `[[M, C^T], [C, 0]]` is nonsingular: then `M + C^T D C` is positive definite for every
+    `D > 0` and has the same accelerations (augmented Lagrangian; Benzi, Golub & Liesen, Acta Numerica
+    14 (2005) 1-137, section 5). It is used for nonsingular ones, too: to distinguish them would take
+    two factorizations in every program.
     """
     if isinstance(M, InvertedBlocks):
         return M
@@ -135,7 +135,7 @@ def factorize_mass(M: Float[Array, "..."] | InvertedBlocks, C: Rows) -> Mass | I
         return _factorize_blocks(M, C)
     symmetric, weights = _is_symmetric(M), jax.lax.stop_gradient(_weights(M, C))
     factorization = factorize_positive(M + gram((C * weights[:, None]).T, C.T))
-    return Mass(None, factorization, weights, symmetric, factorization.full_rank)
+    return Mass(None, factorization, weights, symmetric, factorization.usable)
 
 
 def _is_symmetric(M: Float[Array, "*b n n"]) -> BoolScalar:
@@ -148,21 +148,21 @@ def _is_blocks(shape: tuple[int, ...], n: int) -> bool:
 
 
 def _factorize_blocks(M: Float[Array, "b d d"], C: Rows) -> Mass | InvertedBlocks:
-    """Each of the blocks, under the constraints that concern its coordinates alone (the unit length
-    of a quaternion): a block may be singular in the directions that those exclude."""
+    """Factor each of the blocks, under the constraints on its coordinates alone (the unit length of a
+    quaternion): a block may be singular in the directions that those exclude."""
     if not isinstance(C, SparseRows):
         return factorize_mass(jax.scipy.linalg.block_diag(*M), C)
     symmetric, augmentation = _is_symmetric(M), jnp.zeros((C.structure.num_equations,), M.dtype)
     if C.structure.local.any():
         M, augmentation = _augmented(M, C)
     factorization = jax.vmap(factorize_positive)(M)
-    return Mass(None, factorization, augmentation, symmetric, jnp.all(factorization.full_rank))
+    return Mass(None, factorization, augmentation, symmetric, jnp.all(factorization.usable))
 
 
 def _augmented(
     M: Float[Array, "b d d"], C: SparseRows
 ) -> tuple[Float[Array, "b d d"], Float[Array, " m"]]:
-    """`M + C^T D C` with the diagonal `D` of `_weights` for local constraints, zero for others."""
+    """Return `M + C^T D C` with the diagonal `D` of `_weights` for local constraints, zero for others."""
     number, size, _ = M.shape
     masses = jax.vmap(_masses)(M).reshape(-1)
     seeds = jnp.tile(jnp.eye(size, dtype=M.dtype), (1, number))  # one coordinate of all blocks
@@ -177,15 +177,15 @@ def _augmented(
 
 
 def _weights(M: Float[Array, "n n"], C: Float[Array, "m n"]) -> Float[Array, " m"]:
-    """The diagonal of `D`, `1 / (C diag(M)^-1 C^T)_ii`: then no entry of `C_i^T D_i C_i` exceeds
-    `sqrt(M_jj M_kk)`, and light bodies keep their digits beside heavy ones. Diagonal entries that
-    are zero to rounding count as the mean."""
+    """Return the diagonal of `D`, `1 / (C diag(M)^-1 C^T)_ii`: then no entry of `C_i^T D_i C_i` exceeds
+    `sqrt(M_jj M_kk)`, and light bodies keep their digits beside heavy ones. Diagonal entries that are
+    zero to rounding count as the mean."""
     size = jnp.sum(C * C / _masses(M)[None, :], axis=1)
     return 1 / jnp.maximum(size, jnp.finfo(M.dtype).tiny)
 
 
 def _masses(M: Float[Array, "n n"]) -> Float[Array, " n"]:
-    """The diagonal, with the mean in the place of zeros."""
+    """Return the diagonal, with the mean in the place of zeros."""
     diagonal = jnp.diagonal(M)
     mean, eps = jnp.mean(jnp.abs(diagonal)), jnp.finfo(M.dtype).eps
     return jnp.where(diagonal > 10 * eps * mean, diagonal, mean)

@@ -1,4 +1,4 @@
-"""Everything that the equations of motion need at one state."""
+"""The equations of motion at one state: accelerations and multipliers."""
 
 from collections.abc import Callable
 from typing import Any
@@ -26,13 +26,13 @@ from .saddle_point import Factored, Pair, solve_held_fixed
 
 
 class LagrangianForce(eqx.Module):
-    """`Q + dL/dq - d^2L/dv dq v - d^2L/dv dt`: all of `d/dt dL/dv - dL/dq = Q` but `M a`."""
+    """`Q + dL/dq - d^2L/dv dq v - d^2L/dv dt`: all terms of `d/dt dL/dv - dL/dq = Q` except `M a`."""
 
     lagrangian: Callable
     applied: Callable | None
 
     def __call__(self, t: RealScalarLike, q: Y, v: Y, *rest: Any) -> Y:
-        """`rest` are auxiliary states, if there are any, and the args."""
+        """Evaluate the force; `rest` are the auxiliary states, if there are any, and the args."""
         args = rest[-1]
         x, unravel = jfu.ravel_pytree(q)
         w, _ = jfu.ravel_pytree(v)
@@ -46,12 +46,13 @@ class LagrangianForce(eqx.Module):
         return jax.tree_util.tree_map(jnp.add, force, self.applied(t, q, v, *rest))
 
 
-# Of one equation among those that may depend on each other, beside the size of its terms.
+# Largest residual of a redundant equation, relative to the size of its terms.
 _LARGEST_RESIDUAL = 0.05
 
 
-class Motion:
-    """Everything at one state: `C a = -bias`, the mass matrix, and `C M^-1 C^T`, factored."""
+class EquationsOfMotion:
+    """The quantities of the equations of motion at one state: `C a = -bias`, the mass matrix, and
+    `C M^-1 C^T`, factored."""
 
     def __init__(self, system: Any, t: RealScalarLike, y: Y, args: Args):
         state = y if system.auxiliary is None else split(y)[0]
@@ -70,23 +71,23 @@ class Motion:
             self.factorization = (pseudo_invert if self.redundant else factorize)(gram_matrix)
 
     def solve(self, bias: Float[Array, " m"]) -> Pair:
-        """Accelerations and multipliers of `M a + C^T lambda = Q`, `C a = -bias`."""
+        """Return accelerations and multipliers of `M a + C^T lambda = Q`, `C a = -bias`."""
         force = self.force
         if isinstance(self.factorization, Factorization) and bias.size > UNROLL_LIMIT:
-            # The derivative of `C M^-1 C^T` would cost more than what is around it.
+            # The derivative of `C M^-1 C^T` would cost more than the rest of the program.
             M = self.here.mass_values()
             factored = Factored(self.C, self.directions, self.mass, self.factorization)
             pair = solve_held_fixed(M, factored, force, -bias)
-            return _defined(*pair, self.mass.valid & self.factorization.full_rank)
+            return _defined(*pair, self.mass.valid & self.factorization.usable)
         if self.mass.augmentation is not None:
             force = force - combine(self.mass.augmentation * bias, self.C)
         free = self.mass.solve(force)
         right = multiply(self.C, free) + bias
         multipliers = self.factorization.solve(right)
         accelerations = free - combine(multipliers, self.directions)
-        valid = self.mass.valid & self.factorization.full_rank
+        valid = self.mass.valid & self.factorization.usable
         if isinstance(self.C, AbstractRows):
-            # `M` applied to the free accelerations and to those by the constraints.
+            # `M` applied to the free accelerations and to those caused by the constraints.
             size2 = jnp.abs(jnp.dot(free, force)) + jnp.abs(jnp.dot(multipliers, right))
             residual = multiply(self.C, accelerations) + bias
             valid &= self.factorization.solves(residual, size2)  # pyright: ignore[reportAttributeAccessIssue]
@@ -95,7 +96,7 @@ class Motion:
         return _defined(accelerations, multipliers, valid)
 
     def constrained(self, b: Float[Array, " m"]) -> Float[Array, " n"]:
-        """The smallest change of the velocities, in the metric of the masses, with `C dv = b`."""
+        """Return the smallest change of the velocities, in the metric of the masses, with `C dv = b`."""
         return combine(self.factorization.solve(b), self.directions)
 
     def stabilized_velocity(self) -> Float[Array, " n"]:
@@ -110,20 +111,20 @@ class Motion:
 
 
 def _defined(a: Float[Array, " n"], multipliers: Float[Array, " m"], valid: BoolScalar) -> Pair:
-    """NaN unless valid. Added, not selected: the derivative of a discarded NaN would be NaN."""
+    """Make both NaN unless valid. Added, not selected: the derivative of a discarded NaN would be NaN."""
     undefined = jnp.where(valid, 0, jnp.nan).astype(a.dtype)
     return a + undefined, multipliers + undefined
 
 
 def _agree(C: Float[Array, "m n"], a: Float[Array, " n"], bias: Float[Array, " m"]) -> BoolScalar:
-    """Whether `C a = -bias` but for what equations that depend on each other contradict each other at a
-    stage off the manifold. If not, an independent one was taken for dependent."""
+    """Whether `C a = -bias`, up to the inconsistency that redundant equations have off the manifold. If
+    not, an independent equation was taken for a dependent one."""
     C, a, bias = jax.lax.stop_gradient((C, a, bias))
     sizes = jnp.abs(C)
     own = sizes @ jnp.abs(a) + jnp.abs(bias)
-    # Where nothing moves, for instance across the plane of a planar mechanism in space.
-    any = jnp.max(sizes, axis=1) * jnp.max(jnp.abs(a)) + jnp.max(jnp.abs(bias))
-    return jnp.all(jnp.abs(C @ a + bias) <= _LARGEST_RESIDUAL * (own + 0.02 * any))
+    # For rows without motion, e.g. across the plane of a planar mechanism in space.
+    largest = jnp.max(sizes, axis=1) * jnp.max(jnp.abs(a)) + jnp.max(jnp.abs(bias))
+    return jnp.all(jnp.abs(C @ a + bias) <= _LARGEST_RESIDUAL * (own + 0.02 * largest))
 
 
 def _flat_force(force: Any, q: Y, x: Float[Array, " n"]) -> Float[Array, " n"]:

@@ -1,7 +1,7 @@
 """The equations of motion `M a + C^T lambda = Q`, `C a = r` as one linear system, and its derivative.
 
-By the rule of `A x = b`, `dx = A^-1 (db - dA x)`: the derivative of their elimination would be that of
-every entry of `C M^-1 C^T`, `m^2 n` operations for each direction, where products have `m n`.
+Differentiated as `A x = b`, `dx = A^-1 (db - dA x)`: the derivative of the elimination would be that of
+every entry of `C M^-1 C^T`, `m^2 n` operations for each direction, where products take `m n`.
 """
 
 from typing import Any, NamedTuple
@@ -19,7 +19,7 @@ Pair = tuple[Float[Array, " n"], Float[Array, " m"]]
 
 
 class Factored(NamedTuple):
-    """What the system is solved with: `C`, the rows of `C M^-1`, `M` and `C M^-1 C^T` factored."""
+    """The factors of the system: `C`, the rows of `C M^-1`, and `M` and `C M^-1 C^T` factored."""
 
     C: Float[Array, "m n"]
     directions: Float[Array, "m n"]
@@ -27,7 +27,7 @@ class Factored(NamedTuple):
     factorization: Factorization
 
     def accelerations(self, force: Float[Array, " n"], r: Float[Array, " m"]) -> Pair:
-        """And multipliers."""
+        """Return accelerations and multipliers."""
         if self.mass.augmentation is not None:
             force = force + combine(self.mass.augmentation * r, self.C)
         free = self.mass.solve(force)
@@ -35,19 +35,19 @@ class Factored(NamedTuple):
         return free - combine(multipliers, self.directions), multipliers
 
     def momenta(self, force: Float[Array, " n"], r: Float[Array, " m"]) -> Pair:
-        """`p = M a` and multipliers: `p + C^T lambda = Q`, `C M^-1 p = r`."""
+        """Return `p = M a` and multipliers: `p + C^T lambda = Q`, `C M^-1 p = r`."""
         multipliers = self.factorization.solve(multiply(self.C, self.mass.solve(force)) - r)
         return force - combine(multipliers, self.C), multipliers
 
     def momenta_transposed(self, f: Float[Array, " n"], r: Float[Array, " m"]) -> Pair:
-        """`u + M^-1 C^T mu = f`, `C u = r`."""
+        """Solve the transposed system `u + M^-1 C^T mu = f`, `C u = r`."""
         multipliers = self.factorization.solve(multiply(self.C, f) - r)
         return f - combine(multipliers, self.directions), multipliers
 
 
 def solve_held_fixed(M: Any, factored: Factored, force: Float[Array, " n"], r: Any) -> Pair:
-    """Accelerations and multipliers, with the derivatives of `M` (as of `mass_values`), `C`, `force`
-    and `r`, but not of what was factored."""
+    """Return accelerations and multipliers, with the derivatives of `M` (as of `mass_values`), `C`,
+    `force` and `r`, but not of the factors."""
     C, factored = factored.C, jax.lax.stop_gradient(factored)
     if isinstance(M, InvertedBlocks):  # with M^-1 p in the place of a, as M is not known
         momenta = lambda p, z: (p + combine(z, C), multiply(C, M.solve(p)))
@@ -60,8 +60,8 @@ def solve_held_fixed(M: Any, factored: Factored, force: Float[Array, " n"], r: A
 
 
 def _solve_linear(product: Any, force: Any, r: Any, solve: Any, solve_transposed: Any) -> Pair:
-    """Both unknowns in one vector: `custom_linear_solve` cannot be differentiated where only one of
-    several right-hand sides depends on something (JAX 0.10.2 and 0.12.0)."""
+    """Solve for both unknowns in one vector: `custom_linear_solve` cannot be differentiated if only one
+    of several right-hand sides depends on something (JAX 0.10.2 and 0.12.0)."""
     n = force.size
     as_one = lambda f: lambda x: jnp.concatenate(f(x[:n], x[n:]))
     x = jax.lax.custom_linear_solve(

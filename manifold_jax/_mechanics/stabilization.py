@@ -17,12 +17,11 @@ class Baumgarte(eqx.Module):
 
     - `alpha`, `beta`: 1/time, not negative; `beta = alpha` is critical damping.
 
-    The violation settles at a level set by the truncation error; nothing is on the manifold
-    to round-off. Small gains are best, some `1 / (10 h)` or less for steps `h`; `alpha = 1 / h`
-    is a poor choice, and beyond the stability interval of the solver (`alpha h` of about 2 to
-    3 for explicit Runge-Kutta methods) violations grow without bound: `mj.diffeqsolve` refuses
-    constant steps of that size, adaptive ones get smaller. Prefer
-    [`Projected`][], which needs no gains.
+    The violation settles at a level set by the truncation error; nothing is on the manifold to
+    round-off. Small gains are best, some `1 / (10 h)` or less for steps `h`; `alpha = 1 / h` is a poor
+    choice, and beyond the stability interval of the solver (`alpha h` of about 2 to 3 for explicit
+    Runge-Kutta methods) violations grow without bound: `mj.diffeqsolve` refuses constant steps of that
+    size, adaptive ones get smaller. Prefer [`Projected`][], which needs no gains.
 
     Source: Baumgarte, Comput. Methods Appl. Mech. Engrg. 1 (1972) 1-16.
     """
@@ -36,7 +35,7 @@ class Baumgarte(eqx.Module):
 
     @property
     def rate(self) -> FloatScalar:
-        """The largest modulus of the roots of `s^2 + 2 alpha s + beta^2`."""
+        """Return the largest modulus of the roots of `s^2 + 2 alpha s + beta^2`."""
         alpha, beta = jnp.asarray(self.alpha, float), jnp.asarray(self.beta, float)
         return jnp.maximum(beta, alpha + jnp.sqrt(jnp.maximum(alpha**2 - beta**2, 0)))
 

@@ -19,7 +19,7 @@ from .._solver.terms import DirectedTerm
 from .auxiliary import ExtendedConstraint
 from .constraint import MechanicalConstraint
 from .mass import ConfigurationMass, LagrangianMass
-from .motion import LagrangianForce, Motion
+from .motion import EquationsOfMotion, LagrangianForce
 from .stabilization import Baumgarte, VelocityStabilization
 
 
@@ -210,20 +210,20 @@ class MechanicalSystem(eqx.Module):
         return dfx.ODETerm(self._field)
 
     def accelerations(self, t: RealScalarLike, y: Y, args: Args = None) -> Y:
-        """`a` of `M a + J^T lambda = Q`, like `q`, without stabilization."""
-        motion = Motion(self, t, y, args)
+        """Return `a` of `M a + J^T lambda = Q`, like `q`, without stabilization."""
+        motion = EquationsOfMotion(self, t, y, args)
         return motion.unravel(motion.solve(motion.bias)[0])
 
     def multipliers(self, t: RealScalarLike, y: Y, args: Args = None) -> Float[Array, " m"]:
-        """`lambda` of `M a + J^T lambda = Q`: first those of `position_constraint` in the order of
-        `ravel_pytree`, then those of `velocity_constraint`. The constraint force on the
-        coordinates is `-J^T lambda`. With `redundant=True` the solution with the least forces, the sum of
-        `lambda_i^2 (J M^-1 J^T)_ii`."""
-        motion = Motion(self, t, y, args)
+        """Return `lambda` of `M a + J^T lambda = Q`: first those of `position_constraint` in the order
+        of `ravel_pytree`, then those of `velocity_constraint`. The constraint force on the coordinates
+        is `-J^T lambda`. With `redundant=True` the solution with the least forces: the sum of
+        `lambda_i^2 (J M^-1 J^T)_ii` is minimal."""
+        motion = EquationsOfMotion(self, t, y, args)
         return motion.solve(motion.bias)[1]
 
     def _field(self, t: RealScalarLike, y: Y, args: Args) -> Y:
-        motion = Motion(self, t, y, args)
+        motion = EquationsOfMotion(self, t, y, args)
         a, _ = motion.solve(motion.bias)
         velocity = y[1]
         if isinstance(self.stabilization, VelocityStabilization):
@@ -241,9 +241,9 @@ class MechanicalSystem(eqx.Module):
         return (rates,)
 
     def _stabilized_field(self, t: RealScalarLike, y: Y, args: Args) -> tuple[Y, Y]:
-        """The field, and the part of it that changes sign with the direction of time."""
+        """Return the field, and the part of it that changes sign with the direction of time."""
         assert isinstance(self.stabilization, Baumgarte)
-        motion = Motion(self, t, y, args)
+        motion = EquationsOfMotion(self, t, y, args)
         alpha, beta = self.stabilization.alpha, self.stabilization.beta
         rate, p = motion.here.velocities(), motion.num_positions
         a, _ = motion.solve(motion.bias.at[:p].add(beta**2 * motion.here.positions()))

@@ -1,4 +1,4 @@
-"""Bodies, joints and forces put together: a mechanical system."""
+"""The assembly of bodies, joints and forces, as a mechanical system."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -114,17 +114,16 @@ class Assembly(eqx.Module):
         t: RealScalarLike = 0.0,
         args: Args = None,
     ) -> tuple[Pose, Pose]:
-        """A state `(q, v)`: the drawing at rest, with what is given for some bodies by name.
+        """Return a state `(q, v)`: the drawing at rest, with other values for some bodies by name.
 
         **Arguments:**
 
         - `positions`, `velocities` of centres of mass; `orientations`, as for [`Body`][];
-            `angular_velocities` (rad/s), a number, or in space shape `(3,)`, in the coordinates of
-            space.
-        - `assemble`: keep what is given, and find the rest such that all joints are satisfied, the
-            nearest to the drawing and the slowest. Also inside of `jit`, `vmap` and derivatives, by
-            lengths and by what is given; joints that cannot be closed are then an error while the
-            program runs. (Without it traced states are not checked.)
+            `angular_velocities` (rad/s), a number, or in space shape `(3,)`, in world coordinates.
+        - `assemble`: keep the given values, and find the rest such that all joints are satisfied: the
+            nearest to the drawing, and the slowest. Also inside `jit`, `vmap` and derivatives, with
+            respect to lengths and given values; joints that cannot be closed are then an error at
+            run time. (Without it traced states are not checked.)
         - `t`, `args`: the time of the start and the `args` of the solve, for what [`Drive`][]s prescribe.
 
         **Raises** `ValueError` where joints are not satisfied (without `assemble`) or cannot be:
@@ -137,15 +136,15 @@ class Assembly(eqx.Module):
     def gaps(
         self, q: Pose, t: RealScalarLike = 0.0, args: Args = None
     ) -> dict[str, Float[Array, " r"]]:
-        """Residuals of the joints by name at the first part of a state `(q, v)`: lengths in metres,
-        cosines of angles. `t` and `args` are those of [`Drive`][]s, whose angles are in rad."""
+        """Return residuals of the joints by name at the positions `q` of a state `(q, v)`: lengths in
+        metres, cosines of angles. `t` and `args` are those of [`Drive`][]s, whose angles are in rad."""
         rows = (row for part in residuals(self.joints_at(t, args), q) for row in part)
         return dict(zip(self.joint_names, rows, strict=True))
 
     @over_times
     def motion(self, y: tuple[Pose, Pose], name: str) -> Motion:
-        """Position, orientation, velocity and angular velocity of a body. `y` may have leading axes,
-        here and below, such as `sol.ys`."""
+        """Return position, orientation, velocity and angular velocity of a body. `y` may have leading
+        axes, here and below, such as `sol.ys`."""
         i = self.bodies.moving_index(name, "`motion`")
         q, v = y
         spin = Frames.of(q, v).spin[i]
@@ -154,7 +153,7 @@ class Assembly(eqx.Module):
 
     @over_times
     def point(self, y: tuple[Pose, Pose], name: str, at: Any) -> tuple[Array, Array]:
-        """Position and velocity in space of the point `at` in the frame of a body."""
+        """Return position and velocity in world coordinates of the point `at` in the frame of a body."""
         d = 2 if self.bodies.planar else 3
         i = self.bodies.index(name, "`point`")
         at = check_shape("`at`", at, (d,))
@@ -165,7 +164,7 @@ class Assembly(eqx.Module):
 
     @over_times
     def joint_coordinates(self, y: tuple[Pose, Pose]) -> dict[str, Float[Array, "*t"]]:
-        """Angles of hinges (from `-pi` to `pi`) and displacements of sliders by name, zero in the
+        """Return angles of hinges (`-pi` to `pi`) and displacements of sliders by name, zero in the
         drawing."""
         frames, found = Frames.of(*y), {}
         for group in self.joints:
@@ -177,9 +176,9 @@ class Assembly(eqx.Module):
     def joint_forces(
         self, t: Times, y: tuple[Pose, Pose], args: Args = None
     ) -> dict[str, JointForce]:
-        """Force and torque of every joint on its second body, from the multipliers, at the time `t` or
-        the times of all states. With `redundant` joints it is the sum over those that depend on each
-        other that is determined."""
+        """Return force and torque of every joint on its second body, from the multipliers, at the time
+        `t` or the times of all states. With `redundant` joints only the sum over those that depend on
+        each other is determined."""
         if y[0].position.ndim > 2:
             times = jnp.broadcast_to(floating(t), y[0].position.shape[:1])
             return jax.vmap(lambda t, y: self.joint_forces(t, y, args))(times, y)
@@ -198,7 +197,7 @@ class Assembly(eqx.Module):
 
     @over_times
     def energy(self, y: tuple[Pose, Pose]) -> Energy:
-        """Kinetic energy, and potential energy of weight and springs."""
+        """Return kinetic energy, and potential energy of weight and springs."""
         q, v = y
         bodies, frames = self.bodies, Frames.of(q, v)
         moving = jnp.sum(bodies.mass[:, None] * v.position**2)

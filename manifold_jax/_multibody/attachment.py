@@ -1,4 +1,4 @@
-"""Where joints and forces are attached: points and orthonormal frames in their two bodies."""
+"""Attachment points and orthonormal frames of joints and forces in their two bodies."""
 
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple
@@ -17,7 +17,7 @@ from .rotations import basis, compose, dot, turn, turn_back
 
 
 class Sides(NamedTuple):
-    """Points and frames of `k` joints in space, of their first and of their second bodies."""
+    """Points and frames of `k` joints in world coordinates, of their first and of their second bodies."""
 
     first: Vectors
     second: Vectors
@@ -29,8 +29,7 @@ class Sides(NamedTuple):
         return self.second - self.first
 
     def cosine(self, i: int, j: int) -> Float[Array, " k"]:
-        """Return the cosine of the angle between axis `i` of the first and axis `j` of the second
-        body."""
+        """Return the cosine of the angle between axis `i` of the first and axis `j` of the second body."""
         return dot(self.frame_first[:, :, i], self.frame_second[:, :, j])
 
     def along(self, i: int) -> Float[Array, " k"]:
@@ -38,7 +37,7 @@ class Sides(NamedTuple):
 
     @property
     def angle(self) -> Float[Array, " k"]:
-        """About the third axis, zero in the drawing, from `-pi` to `pi`."""
+        """Return the angle about the third axis, zero in the drawing, from `-pi` to `pi`."""
         return jnp.arctan2(self.cosine(1, 0), self.cosine(0, 0))
 
     def coordinate(self, hinge: bool) -> Float[Array, " k"]:
@@ -46,8 +45,8 @@ class Sides(NamedTuple):
 
 
 class Attachment(eqx.Module):
-    """Which bodies `k` joints or forces belong to (static: the graph of the mechanism), and their
-    points and frames in those, of first and of second bodies."""
+    """The bodies to which `k` joints or forces belong (static: the graph of the mechanism), and their
+    points and frames in these, for first and second bodies."""
 
     names: tuple[str, ...] = eqx.field(static=True)
     bodies: tuple[tuple[int, ...], tuple[int, ...]] = eqx.field(static=True)
@@ -68,7 +67,7 @@ class Attachment(eqx.Module):
         return Sides(at[0], at[1], axes[0], axes[1])
 
     def velocities(self, frames: Frames, sides: Sides) -> Vectors:
-        """Return the velocities of the second points against the first."""
+        """Return the velocities of the second points relative to the first."""
         arms = jnp.stack([sides.first, sides.second]) - frames.origin[self.index]
         moving = frames.velocity[self.index] + jnp.cross(frames.spin[self.index], arms)
         return moving[1] - moving[0]
@@ -77,7 +76,7 @@ class Attachment(eqx.Module):
 def attach(
     bodies: Bodies, things: Sequence[Any], names: Sequence[str], axes: Sequence[Any] | None = None
 ) -> Attachment:
-    """Points and frames of the drawing in the frames of the bodies; `axes` are pairs."""
+    """Convert points and frames of the drawing to the frames of the bodies; `axes` are pairs."""
     placed = [_ends(bodies, thing, name) for thing, name in zip(things, names, strict=True)]
     index, is_drawn, ends = zip(*placed, strict=True)
     axes = [joints.UPRIGHT] * len(things) if axes is None else axes
@@ -100,7 +99,7 @@ def _in_bodies(
 
 
 def _ends(bodies: Bodies, thing: Any, name: str) -> tuple[tuple[int, int], bool, tuple[Any, Any]]:
-    """The bodies of a joint or a force; whether its points are those of the drawing, and the points."""
+    """Return the bodies of a joint or force, its points, and whether these are those of the drawing."""
     if thing.first == thing.second:
         raise ValueError(
             f"{name} connects {thing.first!r} with itself. Give two bodies, or `mj.multibody.GROUND`."
@@ -114,7 +113,7 @@ def _ends(bodies: Bodies, thing: Any, name: str) -> tuple[tuple[int, int], bool,
 
 
 def name_all(given: Any, base: type, what: str) -> list[tuple[Any, str]]:
-    """All joints or forces with their names, those that have none made of kind and bodies."""
+    """Return all joints or forces with their names; default names consist of kind and bodies."""
     things = check_sequence(f"{what}s", given, base, f"{what}s of `mj.multibody`")
     names, count = [], {}
     for thing in things:
@@ -129,7 +128,7 @@ def name_all(given: Any, base: type, what: str) -> list[tuple[Any, str]]:
 
 
 def grouped(things: Iterable[tuple], kind: Callable) -> dict[type, zip]:
-    """Of every `kind(*thing)`, in the order in which these come first, the parts of all its things."""
+    """Group things by `kind(*thing)`, in order of first occurrence; transpose each group."""
     groups: dict[type, list[tuple]] = {}
     for thing in things:
         groups.setdefault(kind(*thing), []).append(thing)

@@ -1,4 +1,4 @@
-"""Rigid bodies: what a user says of each, and the arrays of all of them."""
+"""Rigid bodies: the descriptions that users give, and the arrays of all of them."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -57,8 +57,8 @@ class Body(eqx.Module):
     - `inertia` (kg m^2) about the centre of mass: a number for a body in the plane; for one in
         space the moments about the axes of its frame, shape `(3,)`, or the matrix `(3, 3)`.
     - `position` of the centre of mass (m), shape `(2,)` or `(3,)`, and `orientation` (an angle,
-        or a unit quaternion, scalar first, see [`quaternion`][]) in the *drawing*, the pose in
-        which joints are described. Default: at the origin, not turned.
+        or a unit quaternion, scalar first, see [`quaternion`][]) in the *drawing*, the reference
+        configuration in which joints are described. Default: at the origin, not turned.
 
     Numbers may be traced by JAX. **Raises** `ValueError` for shapes, masses and inertias that no
     body has. A thin rod without a moment about its own axis has no well-defined spin: give a small
@@ -94,7 +94,7 @@ class Body(eqx.Module):
 
 
 def check_orientation(what: str, value: Any, planar: bool) -> Float[Array, "..."]:
-    """An angle, or a unit quaternion."""
+    """Check an angle, or a unit quaternion."""
     if planar:
         return check_shape(what, value, (), advice=", an angle")
     p = check_shape(what, value, (4,), advice=", a unit quaternion")
@@ -137,8 +137,7 @@ def _matrix(inertia: Array) -> Any:
 
 
 class Bodies(eqx.Module):
-    """The arrays of all bodies: masses `(N,)`, moments of inertia `(N,)` or matrices `(N, 3, 3)`,
-    and the drawing."""
+    """The arrays of all bodies: masses `(N,)`, inertias `(N,)` or `(N, 3, 3)`, and the drawing."""
 
     names: tuple[str, ...] = eqx.field(static=True)
     mass: Float[Array, " n"]
@@ -184,11 +183,12 @@ class Bodies(eqx.Module):
         return i
 
     def mass_matrix(self, q: Pose) -> Any:
-        """A diagonal in the plane; in space blocks `diag(m, 4 G^T I G + 4 c p p^T)`, inverted.
+        """Return a diagonal in the plane; in space the inverses of blocks
+        `diag(m, 4 G^T I G + 4 c p p^T)`.
 
-        The last term is without effect, as the norm of `p` is constant, and makes the matrix
-        regular: without it no force is needed to stretch a quaternion. `c` is the mean moment. As the
-        rows of `G` and `p` are orthogonal, of length `|p|`, the inverse of such a block is
+        The last term has no effect, as the norm of `p` is constant, and makes the matrix nonsingular:
+        without it no force is needed to stretch a quaternion. `c` is the mean moment. As the rows of
+        `G` and `p` are orthogonal, of length `|p|`, the inverse of such a block is
         `diag(1/m, (G^T I^-1 G + p p^T / c) / (4 |p|^4))`.
         """
         if self.planar:
@@ -209,7 +209,7 @@ class Bodies(eqx.Module):
         return InvertedBlocks(blocks, symmetric, positive & jnp.all(self.mass > 0))
 
     def gyroscopic(self, q: Pose, v: Pose) -> Float[Array, "..."]:
-        """`-8 G(p')^T I G(p) p'` of every quaternion; nothing in the plane."""
+        """Return `-8 G(p')^T I G(p) p'` of every quaternion; zeros in the plane."""
         if self.planar:
             return jnp.zeros_like(q.orientation)
         G, rates = rates_matrix(q.orientation), rates_matrix(v.orientation)

@@ -1,4 +1,4 @@
-"""What users give: numbers, vectors, names."""
+"""Checks of the numbers, vectors and names that users give."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -15,8 +15,8 @@ from .._base.user_functions import check_function
 
 
 class Values(eqx.Module):
-    """What every one of several joints or forces has as its argument `word`: numbers or arrays of one
-    shape, or functions `f(t, args)` that return them."""
+    """The argument `word` of several joints or forces: numbers or arrays of one shape, or functions
+    `f(t, args)` that return them."""
 
     word: str = eqx.field(static=True)
     names: tuple[str, ...] = eqx.field(static=True)
@@ -34,7 +34,7 @@ class Values(eqx.Module):
         self.given = tuple(v if callable(v) else self._checked(v, name) for v, name in pairs)
 
     def at(self, t: RealScalarLike, args: Args) -> Array:
-        """All in one array `(k, *shape)`."""
+        """Return all values in one array `(k, *shape)`."""
         found = (value(t, args) if callable(value) else value for value in self.given)
         return stack(list(map(self._checked, found, self.names)))
 
@@ -43,7 +43,7 @@ class Values(eqx.Module):
 
 
 def floating(value: Any) -> Array:
-    """A floating-point array; concrete ones in NumPy first, which starts no program."""
+    """Return a floating-point array; concrete numbers are converted by NumPy, without a program."""
     if isinstance(value, jax.Array) and jnp.issubdtype(value.dtype, jnp.floating):
         return value
     return jnp.asarray(value, float)
@@ -54,12 +54,12 @@ def is_concrete(value: Any) -> bool:
 
 
 def on_host(value: Any) -> Any:
-    """Concrete arrays in NumPy, where taking them apart starts no program."""
+    """Return concrete arrays as NumPy arrays, which can be indexed without a program."""
     return np.asarray(value) if is_concrete(value) else value
 
 
 def check_shape(what: str, value: Any, *shapes: tuple[int, ...], advice: str = "") -> Array:
-    """Finite numbers of one of the shapes."""
+    """Check for finite numbers of one of the shapes."""
     expected = " or ".join(f"of shape {shape}" if shape else "a number" for shape in shapes)
     try:
         array = floating(value)
@@ -73,7 +73,7 @@ def check_shape(what: str, value: Any, *shapes: tuple[int, ...], advice: str = "
 
 
 def stack(values: Sequence[Any], axis: int = 0) -> Array:
-    """One array; of concrete values without a program for each."""
+    """Stack into one array; concrete values without a program for each."""
     if all(is_concrete(value) for value in values):
         return jnp.asarray(np.stack([np.asarray(value) for value in values], axis))
     return jnp.stack([jnp.asarray(value) for value in values], axis)

@@ -29,7 +29,7 @@ def _cylindrical(s: Sides, length: Any) -> Float[Array, "k 4"]:
 
 
 def _distance(s: Sides, length: Float[Array, " k"]) -> Float[Array, "k 1"]:
-    """`(|d|^2 / L - L) / 2`: the elongation, with a gradient of length one."""
+    """Return `(|d|^2 / L - L) / 2`: the elongation, with a gradient of length one."""
     return _columns((dot(s.gap, s.gap) / length - length) / 2)
 
 
@@ -40,7 +40,7 @@ def _planar_prismatic(s: Sides, length: Any) -> Float[Array, "k 2"]:
 
 
 def _driven_angle(s: Sides, target: Float[Array, " k"]) -> Float[Array, "k 1"]:
-    """Return by how much the second body is ahead, from `-pi` to `pi`."""
+    """Return the angle by which the second body is ahead, from `-pi` to `pi`."""
     sine, cosine = s.cosine(1, 0), s.cosine(0, 0)
     ahead = sine * jnp.cos(target) - cosine * jnp.sin(target)
     return _columns(jnp.arctan2(ahead, cosine * jnp.cos(target) + sine * jnp.sin(target)))

@@ -1,4 +1,4 @@
-"""Forces, as a user says them; weight is `gravity` of the assembly. Points are given as for joints.
+"""Forces, as users describe them; weight is `gravity` of the assembly. Points are given as for joints.
 
 A `value` is a number or array, or a function `f(t, args)` of the time and the `args` of the solve.
 """
@@ -9,14 +9,14 @@ import equinox as eqx
 
 
 class AbstractForce(eqx.Module):
-    """What acts on bodies besides their weight."""
+    """A force that acts on bodies, besides their weight."""
 
     name: eqx.AbstractVar[str | None]
 
 
 class AbstractLineForce(AbstractForce):
     """A force between two points, along their line: they attract each other with
-    `stiffness (l - length) + damping l' - value`, `l` their distance, as far as it has these."""
+    `stiffness (l - length) + damping l' - value`, where `l` is their distance. Missing terms are zero."""
 
     first: str = eqx.field(static=True)
     second: str = eqx.field(static=True)
@@ -25,26 +25,26 @@ class AbstractLineForce(AbstractForce):
 
 
 class AbstractJointForce(AbstractForce):
-    """A force in a hinge or slider: against its coordinate `x` acts
-    `stiffness (x - rest) + damping x' - value`, as far as it has these."""
+    """A force in a hinge or slider: `stiffness (x - rest) + damping x' - value` acts against its
+    coordinate `x`. Missing terms are zero."""
 
     joint: str = eqx.field(static=True)
 
 
 class Spring(AbstractLineForce):
-    """A spring, and damper, between two points: they attract each other with
-    `stiffness (l - length) + damping l'`, `l` their distance.
+    """A spring with damping between two points: they attract each other with
+    `stiffness (l - length) + damping l'`, where `l` is their distance.
 
-    Where the points coincide the force has no direction: that of a spring of `length` zero is zero
-    there, a damper's `damping` times the velocity of one point against the other, and others are
-    not a number, with which a solve ends.
+    Where the points coincide the force has no direction: a spring of `length` zero has none there, a
+    damper has `damping` times the relative velocity of the points, and any other force is not a number,
+    which ends the solve.
 
     **Arguments:**
 
     - `first`, `second`: names of bodies, one of them may be `mj.multibody.GROUND`.
     - `stiffness` (N/m), `length` at which it is slack (m), `damping` (N s/m).
-    - `between`: its ends in the drawing, a pair of points of space; or `points`, a pair in the frames
-        of the bodies.
+    - `between`: its ends in the drawing, a pair of points in world coordinates; or `points`, a pair in
+        the frames of the bodies.
     """
 
     stiffness: Any = 0.0
@@ -76,13 +76,13 @@ class LinearActuator(AbstractLineForce):
 
 
 class JointSpring(AbstractJointForce):
-    """A spring, and damper, in a hinge or slider: against its coordinate acts
-    `stiffness (x - rest) + damping x'`.
+    """A spring with damping in a hinge or slider: `stiffness (x - rest) + damping x'` acts against its
+    coordinate.
 
     **Arguments:**
 
     - `joint`: the name of a [`Revolute`][] or [`Prismatic`][]. Its coordinate `x`, an angle from
-        `-pi` to `pi` or a distance, is that of the second body against the first, about or along
+        `-pi` to `pi` or a distance, is that of the second body relative to the first, about or along
         its axis (in the plane counter-clockwise), and zero in the drawing.
     - `stiffness` (N m/rad or N/m), `rest` (rad or m), `damping` (N m s/rad or N s/m).
     """
@@ -94,8 +94,8 @@ class JointSpring(AbstractJointForce):
 
 
 class Motor(AbstractJointForce):
-    """A motor in a hinge or slider: the torque (N m) or force (N) `value`, a number or `f(t, args)`, on
-    the second body in the direction of the joint's coordinate, and its opposite on the first.
+    """A motor in a hinge or slider: the torque (N m) or force (N) `value`, a number or `f(t, args)`,
+    acts on the second body in the direction of the joint's coordinate, and its opposite on the first.
 
     **Arguments:** `joint` as for [`JointSpring`][]; `value`.
     """
@@ -105,7 +105,7 @@ class Motor(AbstractJointForce):
 
 
 class Force(AbstractForce):
-    """A force on a body, in the coordinates of space.
+    """A force on a body, in world coordinates.
 
     **Arguments:**
 
@@ -120,8 +120,8 @@ class Force(AbstractForce):
 
 
 class Torque(AbstractForce):
-    """A torque on a body: `value` (N m), in the coordinates of space, shape `(3,)`, in the plane a
-    number, or `f(t, args)` that returns it. `body`: its name."""
+    """A torque on a body: `value` (N m), in world coordinates, shape `(3,)`, in the plane a number, or
+    `f(t, args)` that returns it. `body`: its name."""
 
     body: str = eqx.field(static=True)
     value: Any

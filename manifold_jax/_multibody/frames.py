@@ -1,4 +1,4 @@
-"""Where the bodies are in space, and how they move: origins and rotation matrices of their frames."""
+"""Origins, rotation matrices and velocities of the frames of bodies in world coordinates."""
 
 from typing import NamedTuple, TypeAlias
 
@@ -15,7 +15,7 @@ Vectors: TypeAlias = Float[Array, "k 3"]  # one for each of several joints or fo
 
 
 class Placed(NamedTuple):
-    """Where the frames of bodies are in space; those in the plane are turned about the third axis."""
+    """The placement of the frames of bodies; those in the plane are turned about the third axis."""
 
     origin: Float[Array, "*n 3"]
     rotation: Float[Array, "*n 3 3"]
@@ -29,15 +29,15 @@ class Placed(NamedTuple):
 
 
 def with_ground(rows: Float[Array, "n c"]) -> Float[Array, "n_and_1 c"]:
-    """The coordinates of bodies and, last, of the ground."""
+    """Append the coordinates of the ground to those of the bodies."""
     upright = np.zeros((1, rows.shape[-1]))
     upright[0, 3:4] = 1  # of a quaternion
     return jnp.concatenate([rows, jnp.asarray(upright, rows.dtype)])
 
 
 class Frames(NamedTuple):
-    """Origins, rotations, velocities and angular velocities in space of all bodies and, last, of
-    the ground."""
+    """Origins, rotations, velocities and angular velocities of all bodies and, last, of the ground, in
+    world coordinates."""
 
     origin: Float[Array, "n 3"]
     rotation: Float[Array, "n 3 3"]
@@ -58,5 +58,5 @@ class Frames(NamedTuple):
 
 @jax.jit
 def in_space(rows: Float[Array, "*n d"]) -> Float[Array, "*n 3"]:
-    """Vectors in the plane with a third component of zero."""
+    """Return vectors in the plane with a third component of zero."""
     return jnp.pad(rows, ((0, 0),) * (rows.ndim - 1) + ((0, 3 - rows.shape[-1]),))

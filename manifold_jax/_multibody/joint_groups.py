@@ -1,5 +1,4 @@
-"""The joints of an assembly and the drives of some, those of one kind together: residuals, Jacobian, and
-what they transmit."""
+"""Joints and drives of an assembly, grouped by kind: residuals, Jacobian, and reaction forces."""
 
 import dataclasses
 from typing import Any
@@ -21,12 +20,12 @@ from .rotations import length_of
 
 
 class JointGroup(eqx.Module):
-    """All joints of one kind, or all drives of hinges or of sliders: these have `motions`."""
+    """All joints of one kind, or all drives of hinges or of sliders: the latter have `motions`."""
 
     kind: type = eqx.field(static=True)
     planar: bool = eqx.field(static=True)
     attachment: Attachment
-    length: Float[Array, " k"]  # of rods; of drives where their joints have to be
+    length: Float[Array, " k"]  # of rods; of drives the prescribed coordinates
     motions: Values | None = None
 
     def residual(self, sides: Sides) -> Float[Array, "k r"]:
@@ -41,7 +40,7 @@ class JointGroup(eqx.Module):
         return dataclasses.replace(self, length=self.motions.at(t, args))
 
 
-Found = tuple[JointGroup, int]  # a joint: its group and its place in that
+Found = tuple[JointGroup, int]  # a joint: its group, and its place in the group
 
 
 def group_restraints(bodies: Bodies, given: Any) -> tuple[JointGroup, ...]:
@@ -79,7 +78,7 @@ def find_joint(groups: tuple[JointGroup, ...], joint: str, name: str, advice: st
 
 
 def attachment_of(found: tuple[Found, ...], names: tuple[str, ...]) -> Attachment:
-    """Return the attachment to the bodies of joints, as these are."""
+    """Return the attachments of these joints."""
     first, second = (
         tuple(group.attachment.bodies[side][i] for group, i in found) for side in (0, 1)
     )
@@ -136,8 +135,8 @@ def residuals(groups: tuple[JointGroup, ...], q: Pose) -> tuple[Float[Array, "k 
 
 
 def jacobian(groups: tuple[JointGroup, ...], q: Pose) -> Float[Array, "r n c"]:
-    """Derivatives of all equations of joints with respect to the coordinates of the bodies, of which
-    each joint depends on two: one derivative for each coordinate of these, all joints at once."""
+    """Return the derivatives of all equations of joints with respect to the coordinates of the bodies.
+    Each joint depends on two: one derivative for each of their coordinates, for all joints at once."""
     index, rows = _index(groups), with_ground(q.coordinates)
     number, size = rows.shape
     if not groups:
@@ -171,7 +170,7 @@ def _residuals(groups: tuple[JointGroup, ...], here: Float[Array, "2 k c"]) -> A
 
 
 def _index(groups: tuple[JointGroup, ...]) -> np.ndarray:
-    """First and second bodies of all joints, `(2, K)`."""
+    """Return the first and second bodies of all joints, shape `(2, K)`."""
     none = np.zeros((2, 0), int)
     return np.concatenate([none, *(group.attachment.index for group in groups)], axis=1)
 
@@ -179,12 +178,12 @@ def _index(groups: tuple[JointGroup, ...]) -> np.ndarray:
 def reactions(
     group: JointGroup, frames: Frames, multipliers: Float[Array, "k r"]
 ) -> tuple[Vectors, Vectors]:
-    """Forces and torques on the second bodies at the second points: `-lambda` times the change of
-    the equations when that body is moved or turned."""
+    """Return forces and torques on the second bodies at the second points: `-lambda` times the change
+    of the equations when that body is moved or turned."""
     sides = group.attachment.sides(frames)
 
     def moved(shift: Vectors, angle: Vectors) -> Float[Array, "k r"]:
-        """About the second point, to first order."""
+        """Move and turn about the second point, to first order."""
         axes = sides.frame_second
         turned = axes + jnp.cross(angle[:, :, None], axes, axis=1)
         return group.residual(sides._replace(second=sides.second + shift, frame_second=turned))

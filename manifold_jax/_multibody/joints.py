@@ -1,5 +1,5 @@
-"""Joints, as a user says them. Points and axes are those of the drawing, the pose of the bodies in
-their `position` and `orientation`, in the coordinates of space."""
+"""Joints, as users describe them. Points and axes are those of the drawing, the pose of the bodies in
+their `position` and `orientation`, in world coordinates."""
 
 from typing import Any
 
@@ -11,15 +11,15 @@ from .checks import as_pair, check_axis, check_shape, is_concrete
 
 
 class AbstractRestraint(eqx.Module):
-    """What bodies cannot but follow: a joint, or the drive of one."""
+    """A restriction of the motion of bodies: a joint, or the drive of one."""
 
 
 class AbstractJoint(AbstractRestraint):
-    """What holds two bodies together, or one to `mj.multibody.GROUND`.
+    """A connection of two bodies, or of one with `mj.multibody.GROUND`.
 
-    The point of the joint is either `at`, a point of space in the drawing, which is then a point of
-    both bodies; or `points`, a pair, one in the frame of each body (of the ground: in space), for
-    which the drawing need not be closed.
+    The point of the joint is either `at`, a point in world coordinates in the drawing, which is then a
+    point of both bodies; or `points`, a pair, one in the frame of each body (of the ground: in world
+    coordinates), for which the drawing need not be closed.
     """
 
     first: str = eqx.field(static=True)
@@ -42,7 +42,7 @@ class AbstractJointWithoutAxis(AbstractPointJoint):
 
 
 class AbstractJointWithAxis(AbstractPointJoint):
-    """The kind says what its `axis` is."""
+    """A joint with a direction, `axis`, whose meaning depends on the kind."""
 
     axis: Any = None
     points: Any = None
@@ -85,10 +85,10 @@ class Universal(AbstractJointWithAxis):
 
 
 class Fixed(AbstractJointWithoutAxis):
-    """A weld: no motion against the drawing. Three equations in the plane, six in space.
+    """A weld: no relative motion. Three equations in the plane, six in space.
 
-    **Arguments:** as for [`Revolute`][], without an axis; `at` is where joint forces are told, by
-    default the centre of mass of the first body that is not the ground.
+    **Arguments:** as for [`Revolute`][], without an axis; `at` is the point for joint forces, by default the
+    centre of mass of the first body that is not the ground.
     """
 
 
@@ -98,8 +98,8 @@ class Distance(AbstractJoint):
     **Arguments:**
 
     - `first`, `second`, `name`: as for [`Revolute`][].
-    - `between`: its ends in the drawing, a pair of points of space; or `points`, a pair in the frames
-        of the bodies.
+    - `between`: its ends in the drawing, a pair of points in world coordinates; or `points`, a pair in
+        the frames of the bodies.
     - `length` (m), positive; by default that of the drawing.
     """
 
@@ -110,19 +110,19 @@ class Distance(AbstractJoint):
 
 
 class Drive(AbstractRestraint):
-    """A drive that moves a hinge or slider as prescribed, with whatever torque or force that takes: one
-    equation, `x - motion(t, args) = 0` (a rheonomic constraint).
+    """A drive that moves a hinge or slider as prescribed, with whatever torque or force is required:
+    one equation, `x - motion(t, args) = 0` (a rheonomic constraint).
 
     **Arguments:**
 
-    - `joint`: the name of a [`Revolute`][] or [`Prismatic`][], of which there may be one drive.
+    - `joint`: the name of a [`Revolute`][] or [`Prismatic`][], which may have only one drive.
     - `motion`: its coordinate `x` (rad or m) as a function `f(t, args)` with two derivatives, or a
-        number; that of [`JointSpring`][], but angles go on beyond `pi`.
-    - `name`: by default made of its joint. `Assembly.joint_forces` has under it the torque or force
-        of the drive.
+        number; that of [`JointSpring`][], but angles continue beyond `pi`.
+    - `name`: by default made from that of its joint. `Assembly.joint_forces` reports the torque or force
+        of the drive under this name.
 
-    `Assembly` raises `ValueError` for a joint that is not there, has several drives, or another kind.
-    Where the torque is known instead of the motion, use [`Motor`][].
+    `Assembly` raises `ValueError` for a joint that does not exist, has several drives, or is of another
+    kind. Use [`Motor`][] if the torque is known instead of the motion.
     """
 
     joint: str = eqx.field(static=True)
@@ -134,12 +134,12 @@ WITH_AXIS = {
     False: (Revolute, Universal, Cylindrical, Prismatic),
     True: (Prismatic,),  # in the plane
 }
-# Without an axis: of frames whose columns are those of the body, as far as possible.
+# Axes of joints without an axis: frames whose columns are those of the body, as far as possible.
 UPRIGHT = np.array([0.0, 0.0, 1.0]), np.array([0.0, 0.0, 1.0])
 
 
 def ends(thing: Any, name: str, planar: bool) -> tuple[bool, tuple[Any, Any]]:
-    """Whether the two points of a joint or a force are those of the drawing, and the points."""
+    """Return whether the two points of a joint or a force are those of the drawing, and the points."""
     if isinstance(thing, AbstractPointJoint):
         word, drawn = "at", None if thing.at is None else (thing.at, thing.at)
     else:
@@ -156,8 +156,8 @@ def ends(thing: Any, name: str, planar: bool) -> tuple[bool, tuple[Any, Any]]:
 
 
 def drawn_axes(joint: AbstractJoint, name: str, planar: bool) -> tuple[Any, Any]:
-    """Return the axes of the first and of the second body, in space. In the plane the axis of a
-    slider lies in it."""
+    """Return the axes of the first and of the second body, in world coordinates. In the plane the axis
+    of a slider lies in it."""
     axis = getattr(joint, "axis", None)
     if not isinstance(joint, WITH_AXIS[planar]):
         if axis is not None:

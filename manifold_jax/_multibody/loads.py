@@ -1,4 +1,4 @@
-"""What forces do to the bodies, all of one kind in one array computation."""
+"""Loads: the effects of forces on the bodies, all of one kind in one array computation."""
 
 import abc
 from typing import Any
@@ -28,16 +28,16 @@ class AbstractLoads(eqx.Module):
 
     @abc.abstractmethod
     def wrench(self, t: RealScalarLike, frames: Frames, args: Args) -> Wrench:
-        """Forces and torques on the bodies and, last, the ground."""
+        """Return forces and torques on the bodies and, last, the ground."""
 
     @abc.abstractmethod
     def potential(self, frames: Frames) -> FloatScalar:
-        """The energy stored in springs."""
+        """Return the energy stored in springs."""
 
 
 class SpringLaws(eqx.Module):
-    """`stiffness (x - rest) + damping x' - value` against coordinates `x` of `k` forces; `values` is
-    `None` where nothing is driven."""
+    """`stiffness (x - rest) + damping x' - value` against the coordinates `x` of `k` forces; `values`
+    is `None` if there are none."""
 
     stiffness: Float[Array, " k"]
     rest: Float[Array, " k"]
@@ -57,7 +57,7 @@ class SpringLaws(eqx.Module):
 
 
 class LineLoads(AbstractLoads):
-    """Between two points, against their distance: springs, dampers, cylinders."""
+    """Loads along lines between two points, against their distance: springs, dampers, cylinders."""
 
     attachment: Attachment
     laws: SpringLaws
@@ -72,9 +72,9 @@ class LineLoads(AbstractLoads):
         return add(at_first, apply(frames, second, sides.second, -pull, none))
 
     def _pull(self, t: RealScalarLike, gap: Vectors, velocity: Vectors, args: Args) -> Vectors:
-        """Return the forces on the first points. Where two coincide, the direction of their line
-        is that of their motion: the limit of what has one, not a number for what jumps there from
-        one side to the other."""
+        """Return the forces on the first points. Where two points coincide, their relative motion gives
+        the direction of the line: the limit for forces that have one; NaN for forces that jump from one
+        side to the other."""
         distance = length_of(gap)
         apart = distance > 0
         direction = gap / jnp.where(apart, distance, 1)[:, None]
@@ -91,7 +91,7 @@ class LineLoads(AbstractLoads):
 
 
 class JointLoads(AbstractLoads):
-    """Forces in hinges, or in sliders."""
+    """Loads in hinges, or in sliders."""
 
     hinge: bool = eqx.field(static=True)
     attachment: Attachment
@@ -140,7 +140,7 @@ class BodyLoads(AbstractLoads):
 
 
 def apply(frames: Frames, index: np.ndarray, at: Vectors, force: Any, torque: Any) -> Wrench:
-    """Forces at points of space, and torques, summed for every body about its origin."""
+    """Sum forces at points in world coordinates, and torques, for every body about its origin."""
     torque = torque + jnp.cross(at - frames.origin[index], force)
     none = jnp.zeros_like(frames.origin)
     return none.at[index].add(force), none.at[index].add(torque)
@@ -165,7 +165,7 @@ def group_forces(
 
 
 def _kind(force: Any, name: str, found: Found | None) -> type:
-    """The kind of its joint if it is in one."""
+    """Return the kind of the joint that a force acts in, otherwise its own kind."""
     if found is not None:
         return found[0].kind
     kinds = forces.AbstractLineForce, forces.Torque
@@ -184,7 +184,7 @@ def _loads(
 
 
 def _laws(things: tuple, names: tuple[str, ...], rest: str) -> SpringLaws:
-    """What a force does not have is zero."""
+    """Return the laws of forces; missing arguments are zero."""
     named = list(zip(things, names, strict=True))
     stiffness, rest_at, damping = (
         stack([check_shape(f"{n}: `{word}`", getattr(thing, word, 0.0), ()) for thing, n in named])

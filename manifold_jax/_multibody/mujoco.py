@@ -27,8 +27,7 @@ def from_mujoco(
     ignore: Sequence[str] = (),
     redundant: bool = False,
 ) -> Assembly:
-    """The assembly of an MJCF or URDF file, by MuJoCo's parser (`pip install
-    "manifold_jax[mjcf]"`).
+    """The assembly of an MJCF or URDF file, by MuJoCo's parser (`pip install "manifold_jax[mjcf]"`).
 
     Joints are exact here, also those that MuJoCo keeps by soft constraints (`equality`): its
     `solref`, `solimp` and its integrator play no part.
@@ -49,7 +48,7 @@ def from_mujoco(
     damper). The drawing is the pose `qpos0`. Stiffness of hinges counts angles from `-pi` to `pi`.
 
     **Raises** `ValueError` with the names of all elements that are not supported: tendons, contacts,
-    limits, friction, armature, and so on. What does not act on the motion (geometries that do not
+    limits, friction, armature, and so on. Elements without effect on the motion (geometries that do not
     collide, sites, sensors, cameras) is left out.
     """
     mujoco = import_mujoco()
@@ -77,8 +76,8 @@ def from_mujoco(
 
 
 def state_of_mujoco(assembly: Assembly, model: Any, data: Any) -> tuple[Pose, Pose]:
-    """The state `(q, v)` of an assembly of [`from_mujoco`][] where MuJoCo's `data` has `qpos` and
-    `qvel`. Calls `mj_forward` on it."""
+    """Return the state `(q, v)` of an assembly of [`from_mujoco`][] for `qpos` and `qvel` in MuJoCo's
+    `data`. Calls `mj_forward` on it."""
     mujoco = import_mujoco()
     mujoco.mj_forward(model, data)
     rows, kind, both = [], mujoco.mjtObj.mjOBJ_BODY, np.zeros(6)
@@ -116,19 +115,19 @@ def _springs(tree: Tree) -> list[AbstractForce]:
 
 
 def _actuators(tree: Tree, control: Callable | None) -> list[AbstractForce]:
-    """The torque is `gear (gain ctrl + b0 + b1 gear x + b2 gear x')`."""
+    """Return the motors of actuators: the torque is `gear (gain ctrl + b0 + b1 gear x + b2 gear x')`."""
     mujoco, model, found = tree.mujoco, tree.model, []
     if disabled(mujoco, model, "ACTUATION"):
         return found
     for i in range(model.nactuator):
-        # those with a fault were refused before, unless the user wants to leave them out
+        # those with a fault were refused before, unless the user ignores them
         if not (actuator_fault(mujoco, model, i) or _group_disabled(model, i)):
             found += _actuator(tree, control, i)
     return found
 
 
 def _group_disabled(model: Any, i: int) -> bool:
-    """The groups that MuJoCo can switch off are 0 to 30."""
+    """Whether the group of an actuator is disabled; MuJoCo can disable groups 0 to 30."""
     group = int(model.actuator_group[i])
     return 0 <= group <= 30 and bool(int(model.opt.disableactuator) >> group & 1)
 
@@ -152,7 +151,7 @@ def _actuator(tree: Tree, control: Callable | None, i: int) -> list[AbstractForc
 
 
 class _Drive(eqx.Module):
-    """One of the controls, within its limits, times a factor, and a constant."""
+    """One control, within its limits, times a factor, plus a constant."""
 
     control: Callable | None
     index: int = eqx.field(static=True)

@@ -1,4 +1,4 @@
-"""What of a MuJoCo model cannot be an assembly, by name."""
+"""Checks for elements of a MuJoCo model that an assembly does not support, by name."""
 
 from collections.abc import Iterator, Sequence
 from typing import Any
@@ -8,8 +8,8 @@ import numpy as np
 
 Index = int | np.integer
 
-# Attribute of the model, what its entries belong to, and what a user calls it. Any entry that is not
-# zero is refused. Names of older and newer versions.
+# Attribute of the model, the kind of element its entries belong to, and the user's name for it. Any
+# nonzero entry is refused. With the names of older and newer versions.
 REFUSED = (
     ("jnt_limited", "joint", "joint limit"),
     ("jnt_actfrclimited", "joint", "actuator force limit"),
@@ -129,7 +129,7 @@ def _with_one_coordinate(mujoco: Any, model: Any, joint: Index) -> bool:
 
 
 def _forces_of_joints(mujoco: Any, model: Any) -> Iterator[tuple[str, str]]:
-    """Springs and dampers of joints that have no single coordinate here."""
+    """Refuse springs and dampers of joints that have no single coordinate here."""
     for d in range(model.nv):
         joint = model.dof_jntid[d]
         if not _with_one_coordinate(mujoco, model, joint) and model.dof_damping[d] != 0:
@@ -143,7 +143,7 @@ def _forces_of_joints(mujoco: Any, model: Any) -> Iterator[tuple[str, str]]:
 
 
 def actuator_fault(mujoco: Any, model: Any, i: Index) -> str | None:
-    """Why an actuator cannot be a motor in a joint."""
+    """Return the reason why an actuator cannot be a motor in a joint, if there is one."""
     on_joint = {int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT)}
     biases = {int(mujoco.mjtBias.mjBIAS_NONE), int(mujoco.mjtBias.mjBIAS_AFFINE)}
     if int(model.actuator_trntype[i]) not in on_joint:
@@ -176,8 +176,8 @@ def _elements(mujoco: Any, model: Any) -> Iterator[tuple[str, str]]:
 
 
 def _contacts(mujoco: Any, model: Any) -> Iterator[tuple[str, str]]:
-    """The first geometry that may touch another; those of one body, and of a body and its parent
-    that moves, do not."""
+    """Return the first geometry that may touch another; those of one body, and of a body and its moving
+    parent, do not."""
     if disabled(mujoco, model, "CONTACT"):
         return
     if model.npair > 0:

@@ -14,13 +14,13 @@ class Tree:
 
     def __init__(self, mujoco: Any, model: Any, drawing: Any):
         self.mujoco, self.model, self.drawing = mujoco, model, drawing
-        self.joint_of: dict[int, str] = {}  # those with a coordinate, by their index
+        self.joint_of: dict[int, str] = {}  # joints with a coordinate, by their index
 
     def name(self, kind: str, i: Index) -> str:
         return name_of(self.mujoco, self.model, kind, i)
 
     def body(self, i: Index) -> str:
-        """The name of the body that body `i` is part of."""
+        """Return the name of the body that body `i` is part of."""
         model = self.model
         if model.body_weldid[i] == 0:
             return GROUND
@@ -45,7 +45,7 @@ class Tree:
         return [joint for i in self._moving() for joint in self._joint(i)]
 
     def _moving(self) -> list[int]:
-        """Those that are not part of others."""
+        """Return the bodies that are not parts of others."""
         bodies = range(1, self.model.nbody)
         return [i for i in bodies if self.body(i) == self.name("body", i)]
 
@@ -88,8 +88,8 @@ class Tree:
         return [self._equality(e) for e in active if not equality_fault(self.mujoco, model, e)]
 
     def _equality(self, e: Index) -> AbstractJoint:
-        """Of two bodies or sites, each with a point in its frame: a connect keeps the points together, a
-        weld the frames, too, which must be so in the drawing."""
+        """Convert an equality constraint of two bodies or sites, each with a point in its frame: a
+        connect keeps the points together, a weld also the frames, which must coincide in the drawing."""
         model, drawing, mujoco = self.model, self.drawing, self.mujoco
         name, data = self.name("equality", e), model.eq_data[e]
         objects = bodies = model.eq_obj1id[e], model.eq_obj2id[e]
@@ -116,7 +116,7 @@ class Tree:
         return Fixed(*map(self.body, bodies), at=other, name=name)
 
     def _in_body(self, body: Index, point: np.ndarray) -> np.ndarray:
-        """Return the point in our frame, that of its inertia."""
+        """Return the point in our frame of the body, that of its inertia."""
         name = self.body(body)
         if name == GROUND:
             return point

@@ -1,4 +1,4 @@
-"""What the states of an assembly say: bodies by name, joints by name, energies."""
+"""Results of an assembly from its states: bodies by name, joints by name, energies."""
 
 import functools
 from collections.abc import Callable
@@ -17,7 +17,7 @@ Times = RealScalarLike | Float[Array | np.ndarray, "*t"]  # of one state, or of 
 
 class Motion(NamedTuple):
     """The motion of one body: its centre of mass and orientation, velocity, and angular velocity in
-    the coordinates of space (in the plane a number)."""
+    world coordinates (in the plane a number)."""
 
     position: Float[Array, "*t d"]
     orientation: Float[Array, "..."]
@@ -26,8 +26,8 @@ class Motion(NamedTuple):
 
 
 class JointForce(NamedTuple):
-    """What a joint does to its second body: a force (N) at the joint's point of that body and a
-    torque (N m) about it, in the coordinates of space; the opposite acts on the first."""
+    """The reaction of a joint on its second body: a force (N) at the joint's point of that body and a
+    torque (N m) about it, in world coordinates; the opposite acts on the first."""
 
     force: Float[Array, "*t d"]
     torque: Float[Array, "..."]

@@ -1,4 +1,4 @@
-"""Unit quaternions, scalar first, and what they do to vectors; all for many bodies at once.
+"""Unit quaternions, scalar first, and the rotation of vectors; all for many bodies at once.
 
 Source: Haug, Computer Aided Kinematics and Dynamics of Mechanical Systems (1989), ch. 9.
 """
@@ -15,7 +15,7 @@ from .checks import check_axis, check_shape
 
 
 def quaternion(axis: Any, angle: Any) -> Float[Array, "4"]:
-    """The unit quaternion `(cos(angle/2), sin(angle/2) axis / |axis|)` of a turn about an axis.
+    """Return the unit quaternion `(cos(angle/2), sin(angle/2) axis / |axis|)` of a turn about an axis.
 
     **Arguments:**
 
@@ -31,7 +31,7 @@ def _about(axis: Float[Array, "3"], angle: Float[Array, ""]) -> Float[Array, "4"
 
 
 def rotation_matrix(p: Float[Array, "*n 4"]) -> Float[Array, "*n 3 3"]:
-    """`R(p)`, which turns vectors of the body into space; quadratic in `p`."""
+    """Return `R(p)`, which turns vectors of the body to world coordinates; quadratic in `p`."""
     a, b, c, d = p[..., 0], p[..., 1], p[..., 2], p[..., 3]
     rows = [
         [a * a + b * b - c * c - d * d, 2 * (b * c - a * d), 2 * (b * d + a * c)],
@@ -42,8 +42,7 @@ def rotation_matrix(p: Float[Array, "*n 4"]) -> Float[Array, "*n 3 3"]:
 
 
 def rates_matrix(p: Float[Array, "*n 4"]) -> Float[Array, "*n 3 4"]:
-    """`G(p)`: the angular velocity in the frame of the body is `2 G(p) p'`, and
-    `p' = G(p)^T omega / 2`."""
+    """Return `G(p)`: the angular velocity in the body is `2 G(p) p'`, and `p' = G(p)^T omega / 2`."""
     a, b, c, d = p[..., 0], p[..., 1], p[..., 2], p[..., 3]
     rows = [[-b, a, d, -c], [-c, -d, a, b], [-d, c, -b, a]]
     return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
@@ -51,39 +50,39 @@ def rates_matrix(p: Float[Array, "*n 4"]) -> Float[Array, "*n 3 4"]:
 
 @jax.jit
 def quaternion_rate(p: Float[Array, "*n 4"], spin: Float[Array, "*n 3"]) -> Float[Array, "*n 4"]:
-    """`p' = G(p)^T R(p)^T omega / 2` of angular velocities in space."""
+    """Return `p' = G(p)^T R(p)^T omega / 2` for angular velocities in world coordinates."""
     return turn_back(rates_matrix(p), turn_back(rotation_matrix(p), spin)) / 2
 
 
 def planar_rotation(angle: Float[Array, "*n"]) -> Float[Array, "*n 3 3"]:
-    """The turn by an angle about the third axis."""
+    """Return the turn by an angle about the third axis."""
     c, s, zero, one = jnp.cos(angle), jnp.sin(angle), jnp.zeros_like(angle), jnp.ones_like(angle)
     rows = [[c, -s, zero], [s, c, zero], [zero, zero, one]]
     return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
 
 
 def turn(R: Float[Array, "*n i j"], s: Float[Array, "*n j"]) -> Float[Array, "*n i"]:
-    """`R_k s_k`; small products as sums, which fuse."""
+    """Return `R_k s_k`; small products as sums, which fuse."""
     return jnp.sum(R * s[..., None, :], axis=-1)
 
 
 def turn_back(R: Float[Array, "*n i j"], s: Float[Array, "*n i"]) -> Float[Array, "*n j"]:
-    """`R_k^T s_k`."""
+    """Return `R_k^T s_k`."""
     return jnp.sum(R * s[..., :, None], axis=-2)
 
 
 def compose(R: Float[Array, "*n i j"], S: Float[Array, "*n j k"]) -> Float[Array, "*n i k"]:
-    """`R_k S_k`."""
+    """Return `R_k S_k`."""
     return jnp.sum(R[..., :, :, None] * S[..., None, :, :], axis=-2)
 
 
 def inverted(A: Float[Array, "n 3 3"]) -> tuple[Float[Array, "n 3 3"], BoolScalar]:
-    """The inverses of symmetric matrices by their cofactors, and whether all are positive definite."""
+    """Return the inverses of symmetric matrices (cofactors), and whether all are positive definite."""
     next, last = np.array([1, 2, 0]), np.array([2, 0, 1])
     part = lambda i, j: A[:, i[:, None], j[None, :]]
     cofactors = part(next, next) * part(last, last) - part(next, last) * part(last, next)
     determinant = jnp.sum(A[:, 0] * cofactors[:, 0], axis=1)
-    # the leading minors beside the size of their terms
+    # the leading minors relative to the size of their terms
     diagonal, tiny = jnp.diagonal(A, axis1=1, axis2=2), 100 * jnp.finfo(A.dtype).eps
     second = cofactors[:, 2, 2] > tiny * diagonal[:, 0] * diagonal[:, 1]
     positive = jnp.all(diagonal > 0, axis=1) & second
@@ -97,13 +96,13 @@ def dot(a: Float[Array, "*n i"], b: Float[Array, "*n i"]) -> Float[Array, "*n"]:
 
 
 def length_of(a: Float[Array, "*n i"]) -> Float[Array, "*n"]:
-    """`|a|`, with the derivative zero where it is zero."""
+    """Return `|a|`, with derivative zero where it is zero."""
     square = dot(a, a)
     return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1)), 0)
 
 
 def basis(axis: Float[Array, "*n 3"]) -> Float[Array, "*n 3 3"]:
-    """Right-handed orthonormal frames whose third column has the direction of `axis`."""
+    """Return right-handed orthonormal frames whose third column has the direction of `axis`."""
     w = axis / jnp.sqrt(dot(axis, axis))[..., None]
     least = jnp.argmin(jnp.abs(w), axis=-1)
     helper = jnp.eye(3, dtype=w.dtype)[least]

@@ -1,9 +1,9 @@
-"""States of an assembly: from what a user says of some bodies, and whether and how they satisfy the joints,
-by NumPy where all numbers are known, otherwise (inside of `jit`, `vmap` and derivatives) in the program
-that is traced.
+"""Initial states of an assembly: completed from what is known of some bodies, and checked against the
+joints. By NumPy if all numbers are known, otherwise (inside `jit`, `vmap` and derivatives) in the
+traced program.
 
 Source of the assembly analysis: Haug, Computer Aided Kinematics and Dynamics of Mechanical Systems
-(1989), ch. 4, here with steps of least norm, `x - J^+ phi(x)` in what is free.
+(1989), ch. 4, here with steps of least norm, `x - J^+ phi(x)` in the coordinates that are free.
 """
 
 import functools
@@ -25,13 +25,13 @@ from .checks import check_shape, is_concrete, on_host, stack
 from .rotations import quaternion_rate
 
 
-# Joints count as closed below this gap (m, or the cosine of an angle), or this many units of rounding.
+# Joints count as closed below this gap (m, or the sine of an angle), or this many units of rounding.
 CLOSED, ROUNDING = 1e-6, 50
 ITERATIONS = 50
-# Singular values below this fraction of the largest belong to equations that depend on others; at
-# least a hundred units of rounding.
+# Singular values below this fraction of the largest belong to redundant equations; at least a hundred
+# units of rounding.
 DEPENDENT = 1e-9
-# Likewise eigenvalues of `J J^T`, in a program that is traced.
+# The same for eigenvalues of `J J^T`, in a traced program.
 DEPENDENT_TRACED = 1e-12
 
 
@@ -42,19 +42,19 @@ def make_state(
     known = all(is_concrete(leaf) for leaf in jtu.tree_leaves((y, assembly, t, args)))
     if not known and not assemble:
         return y
-    closing = Closing(assembly, y, kept, t, args)
+    closure = LoopClosure(assembly, y, kept, t, args)
     if not known:
-        return closing.assembled_when_run()
+        return closure.assembled_when_run()
     if assemble:
-        y = closing.assembled()
-    closing.check(y)
+        y = closure.assembled()
+    closure.check(y)
     return y
 
 
 def _with_given(
     assembly: Any, given: tuple
 ) -> tuple[tuple[Pose, Pose], tuple[np.ndarray, np.ndarray]]:
-    """The state, and which of its coordinates and of their rates are given."""
+    """Return the state, and which of its coordinates and of their rates are given."""
     bodies = assembly.bodies
     q, planar = bodies.drawing, bodies.planar
     positions, orientations, velocities, spins = given
@@ -75,23 +75,23 @@ def _with_given(
 
 
 def _place(
-    bodies: Any, rows: Any, words: Any, what: str, checked: Callable
+    bodies: Any, rows: Any, by_name: Any, what: str, checked: Callable
 ) -> tuple[Array, np.ndarray]:
-    """The rows with those that are given by name, and which are."""
-    words = {} if words is None else words
-    if not isinstance(words, dict):
-        raise TypeError(f"`{what}` must be a dictionary of names of bodies, got {words!r}.")
+    """Return the rows, those that are given by name replaced, and which are given."""
+    by_name = {} if by_name is None else by_name
+    if not isinstance(by_name, dict):
+        raise TypeError(f"`{what}` must be a dictionary of names of bodies, got {by_name!r}.")
     has = np.zeros(len(bodies.names), bool)
     rows = list(on_host(rows))
-    for name, value in words.items():
+    for name, value in by_name.items():
         i = bodies.moving_index(name, f"`{what}`")
         rows[i], has[i] = checked(f"`{what}` of {name!r}", value), True
     return stack(rows), has
 
 
-class Closing:
-    """The equations of an assembly as functions of the vector `x` of its coordinates, from the state
-    `x`, `w` whose `free_x`, `free_w` may be moved."""
+class LoopClosure:
+    """Closes the loops of an assembly: its equations as functions of the vector `x` of all coordinates,
+    and the state `x`, `w`, of which `free_x`, `free_w` may be moved."""
 
     def __init__(
         self, assembly: Any, y: tuple[Pose, Pose], kept: tuple[Any, Any], t: Array, args: Args
@@ -103,7 +103,7 @@ class Closing:
         phi = lambda t, x: jfu.ravel_pytree(joints(t, self.unravel(x), args))[0]
         self.phi = lambda x: phi(t, x)
         self.jacobian = lambda x: jax.jacfwd(phi, 1)(t, x)
-        # The rates of the equations while nothing moves: those of drives.
+        # The rates of the equations at rest: those of drives.
         self.driven = lambda x: jax.jvp(lambda t: phi(t, x), (t,), (jnp.ones_like(t),))[1]
         compiled = jax.jit(lambda x: (self.phi(x), self.driven(x), self.jacobian(x)))
         self.known = lambda x: map(np.asarray, compiled(x))
@@ -124,7 +124,7 @@ class Closing:
         ]
 
     def assembled(self) -> tuple[Pose, Pose]:
-        """Gauss-Newton steps of least norm in what is free; velocities by one."""
+        """Close the joints by Gauss-Newton steps of least norm in free coordinates; velocities by one."""
         x, w = np.array(self.x), np.array(self.w)
         for _ in range(ITERATIONS):
             phi, _, J = self.known(x)
@@ -146,26 +146,27 @@ class Closing:
         what = "The velocities do not agree with the joints"
         advice = "Give only those that are known, such that joints allow them, and `assemble=True`."
         most = _closed(x) * max(1, np.abs(w).max())
-        self._refuse_gaps(np.abs(driven + J @ w), most, "m/s", what, advice)
+        self._refuse_gaps(np.abs(driven + J @ w), most, "in m/s or rad/s", what, advice)
         if not self.assembly.redundant:
             self._check_rank(J)
 
     def _check_positions(self, x: np.ndarray, advice: str) -> None:
         phi, _, _ = self.known(x)
         what = "The state does not satisfy the joints"
-        self._refuse_gaps(np.abs(phi), _closed(x), "m", what, advice)
+        unit = "in m or the sine of an angle"
+        self._refuse_gaps(np.abs(phi), _closed(x), unit, what, advice)
 
     def _refuse_gaps(
         self, gaps: np.ndarray, most: float, unit: str, what: str, advice: str
     ) -> None:
-        """Raise with the names of the joints that have the largest gaps, if there are some."""
+        """Raise with the names of the joints that have the largest gaps, if any gap is too large."""
         if gaps.max(initial=0) <= most:
             return
         sizes = [(name, gaps[rows].max()) for name, rows in self.named_rows]
         order = np.argsort([size for _, size in sizes])[::-1][:5]
         largest = [sizes[i] for i in order if not sizes[i][1] <= most]
-        worst = ", ".join(f"{name} (gap {size:.3g} {unit})" for name, size in largest)
-        raise ValueError(f"{what}: {worst}. {advice}")
+        worst = ", ".join(f"{name} (gap {size:.3g})" for name, size in largest)
+        raise ValueError(f"{what}: {worst}, {unit}. {advice}")
 
     def _check_rank(self, J: np.ndarray) -> None:
         J = J / np.maximum(np.linalg.norm(J, axis=1, keepdims=True), np.finfo(J.dtype).tiny)
@@ -182,7 +183,7 @@ class Closing:
         )
 
     def assembled_when_run(self) -> tuple[Pose, Pose]:
-        """The same steps in a traced program, with derivatives through all of them. While it runs an
+        """Take the same steps in a traced program, with derivatives through all of them. At run time an
         error says which joint could not be closed."""
 
         def corrected(x: Float[Array, " n"]) -> Float[Array, " n"]:
@@ -194,7 +195,7 @@ class Closing:
             return jax.lax.cond(unfinished, corrected, lambda x: x, x), None
 
         x, _ = jax.lax.scan(iterate, self.x, None, length=ITERATIONS)
-        x = corrected(x)  # of which the derivative is that of a root
+        x = corrected(x)  # its derivative is that of the root
         J, driven = self.jacobian(x), self.driven(x)
         rate = lambda w: driven + J @ w
         w = self.w.at[self.free_w].add(-_least_norm(J[:, self.free_w], rate(self.w)))

@@ -1,4 +1,4 @@
-"""An assembly as a mechanical system, whether it is there already or built from the args of the solve."""
+"""The mechanical system of an assembly, which exists already or is built from the args of the solve."""
 
 from collections.abc import Callable
 from typing import Any
@@ -31,7 +31,7 @@ class _Mass(eqx.Module):
 
 
 class _Joints(AbstractPositions):
-    """Their equations, and the norms of quaternions."""
+    """The equations of joints, and the norms of quaternions."""
 
     source: Callable
 
@@ -51,7 +51,7 @@ class _Joints(AbstractPositions):
 
 
 class _Forces(eqx.Module):
-    """Weight and loads, and the gyroscopic forces on quaternions."""
+    """The weight, the loads, and the gyroscopic forces on quaternions."""
 
     source: Callable
 

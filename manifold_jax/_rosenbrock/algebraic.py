@@ -44,16 +44,17 @@ _FAULTS = (
 INCONSISTENT = 3
 
 
-class Linearized(NamedTuple):
+class LinearizedEquations(NamedTuple):
     """The equations linearized at one time and state.
 
     - `derivative`: `y'`.
     - `newton`: Newton's step towards consistency.
-    - `kept`: what changes of the state do to `newton` off it, `A^-1 M change`.
-    - `residual`: the largest of an algebraic equation, relative to what changes of the unknowns
-      (`|x| + 1`) by all their digits do to it. Rounding of the state leaves a few units of it, where
-      equations are badly conditioned far more of `newton`.
-    - `finite`, `regular`: whether the equations are defined there, and of index 1.
+    - `kept`: `A^-1 M change`; added to `newton`, the step to the solution that has the `M y` of a state
+        which differs by `change`.
+    - `residual`: the largest residual of an algebraic equation, relative to its change when the unknowns
+        change by `|x| + 1`. Rounding of the state leaves a few units of it, but far more of `newton` where
+        equations are badly conditioned.
+    - `finite`, `nonsingular`: whether the equations are defined there, and of index 1.
     """
 
     derivative: Float[Array, " n"]
@@ -61,16 +62,16 @@ class Linearized(NamedTuple):
     kept: Callable[[Float[Array, " n"]], Float[Array, " n"]]
     residual: FloatScalar
     finite: BoolScalar
-    regular: BoolScalar
+    nonsingular: BoolScalar
 
 
-class Equations(NamedTuple):
+class MassMatrixEquations(NamedTuple):
     """`field(t, x)` and `mass(t, x)`, a scalar, a diagonal or a matrix."""
 
     field: Callable[[RealScalarLike, Float[Array, " n"]], Float[Array, " n"]]
     mass: Callable[[RealScalarLike, Float[Array, " n"]], Float[Array, "..."]]
 
-    def at(self, t: RealScalarLike, x: Float[Array, " n"]) -> Linearized:
+    def at(self, t: RealScalarLike, x: Float[Array, " n"]) -> LinearizedEquations:
         f, M = self.field(t, x), as_matrix(self.mass(t, x), x.size)
         size = jax.lax.stop_gradient(jnp.max(jnp.abs(M), axis=1))
         D = jnp.where(size > 0, 1 / jnp.where(size > 0, size, 1), 1)
@@ -88,29 +89,29 @@ class Equations(NamedTuple):
         s = jnp.where(largest > 0, 1 / jnp.where(largest > 0, largest, 1), 1)
         A = M + s * K
         finite = jnp.all(jnp.isfinite(A)) & jnp.all(jnp.isfinite(f)) & jnp.all(jnp.isfinite(Kt))
-        regular = finite & _is_regular(jax.lax.stop_gradient(A))
-        factor = factorize_pivoted(jnp.where(regular, A, jnp.eye(x.size, dtype=A.dtype)))
-        nan = jnp.where(regular, 0.0, jnp.nan).astype(x.dtype)
+        nonsingular = finite & _is_nonsingular(jax.lax.stop_gradient(A))
+        factor = factorize_pivoted(jnp.where(nonsingular, A, jnp.eye(x.size, dtype=A.dtype)))
+        nan = jnp.where(nonsingular, 0.0, jnp.nan).astype(x.dtype)
         r = P @ (D * f)
-        return Linearized(
+        return LinearizedEquations(
             factor.solve(M @ z - s * Kt) + nan,
             -factor.solve(s * r) + nan,
             lambda change: factor.solve(M @ change),
             _relative_residual(*jax.lax.stop_gradient((r, K, x))) + nan,
             finite,
-            regular,
+            nonsingular,
         )
 
 
 def as_matrix(mass: Float[Array, "..."], n: int) -> Float[Array, "n n"]:
-    """A mass in any of its forms."""
+    """Return a mass in any of its forms as a matrix."""
     return mass if mass.ndim == 2 else jnp.diag(jnp.broadcast_to(mass, (n,)))
 
 
 def _null_space(
     M: Float[Array, "n n"], diagonal: bool
 ) -> tuple[Float[Array, "n n"], Float[Array, "n n"]]:
-    """`M^+`, and the projector onto the left null space of `M`, whose rows have size one."""
+    """Return `M^+`, and the projector onto the left null space of `M`, whose rows have size one."""
     n = M.shape[0]
     unit = n * jnp.finfo(M.dtype).eps
     if diagonal:
@@ -121,12 +122,12 @@ def _null_space(
     M = jnp.where(jnp.all(jnp.isfinite(M)), M, jnp.eye(n, dtype=M.dtype))
     inverse = jnp.linalg.pinv(M, rtol=10 * unit)
     P = jnp.eye(n, dtype=M.dtype) - M @ inverse
-    # What is zero but for rounding would let large differential equations into the algebraic ones.
+    # Entries at rounding level would let large differential equations into the algebraic ones.
     return inverse, jnp.where(jnp.abs(P) > 100 * unit, P, 0)
 
 
-def _is_regular(A: Float[Array, "n n"]) -> BoolScalar:
-    """Whatever the units of equations and unknowns."""
+def _is_nonsingular(A: Float[Array, "n n"]) -> BoolScalar:
+    """Whether `A` is nonsingular, whatever the units of equations and unknowns."""
     A = jnp.where(jnp.all(jnp.isfinite(A)), A, 0)
     for axis in (1, 0):
         size = jnp.max(jnp.abs(A), axis=axis, keepdims=True)
@@ -146,31 +147,30 @@ def relative_size(change: Float[Array, " n"], x: Float[Array, " n"]) -> FloatSca
     return jnp.max(jnp.abs(change) / (jnp.abs(x) + 1), initial=0.0)
 
 
-def is_consistent(x: Float[Array, " n"], linearized: Linearized) -> BoolScalar:
-    return linearized.regular & is_small(relative_size(linearized.newton, x))
+def is_consistent(x: Float[Array, " n"], linearized: LinearizedEquations) -> BoolScalar:
+    return linearized.nonsingular & is_small(relative_size(linearized.newton, x))
 
 
 def is_small(correction: FloatScalar) -> BoolScalar:
-    """Return whether a correction is small to half of the digits: what is beside that would have
-    to be a mistake."""
+    """Whether a correction is small, to half of the digits: anything larger is a mistake in the state."""
     return correction <= jnp.sqrt(jnp.finfo(correction.dtype).eps)
 
 
 class _Iterate(NamedTuple):
     x: Float[Array, " n"]
-    step: Float[Array, " n"]  # from there, not known before the first iteration
-    size: FloatScalar  # of the step
+    step: Float[Array, " n"]  # from the start; unknown before the first iteration
+    size: FloatScalar  # size of the step
     previous: FloatScalar
     residual: FloatScalar
     iterations: IntScalar
     finite: BoolScalar  # whether the equations are defined at the start
-    regular: BoolScalar
+    nonsingular: BoolScalar
 
 
 def consistent(
-    equations: Equations, t: RealScalarLike, x: Float[Array, " n"]
+    equations: MassMatrixEquations, t: RealScalarLike, x: Float[Array, " n"]
 ) -> tuple[Float[Array, " n"], ProjectionInfo]:
-    """`x` with the part that `M` does not see corrected; `x` itself where that fails.
+    """Return `x` with the part corrected that `M` does not determine; `x` itself if that fails.
 
     Iterated without derivatives; those of the root are those of Newton's step there.
     """
@@ -192,15 +192,15 @@ def consistent(
             linearized.residual,
             i.iterations + 1,
             jnp.where(at_start, linearized.finite, i.finite),
-            jnp.where(at_start, linearized.regular, i.regular),
+            jnp.where(at_start, linearized.nonsingular, i.nonsingular),
         )
 
     unknown, yes = jnp.asarray(jnp.inf, x.dtype), jnp.asarray(True)
-    # Compiled once: the start, too, is met in the loop.
+    # The start is evaluated in the loop, too, so that the equations are compiled once.
     none, first = jnp.zeros_like(fixed), jnp.asarray(-1, jnp.int32)
     before = _Iterate(fixed, none, unknown, unknown, unknown, first, yes, yes)
     end = jax.lax.while_loop(unfinished, advance, before)
-    # Where equations are badly conditioned steps end at many units of rounding.
+    # Where equations are badly conditioned, steps end at many units of rounding.
     success = (end.size <= 1e3 * unit) | (end.residual <= 10 * unit)
     moved = jax.lax.stop_gradient(jnp.where(success, end.x, fixed))
 
@@ -214,13 +214,13 @@ def consistent(
         iterations=end.iterations,
         residual=jnp.where(end.finite, jnp.where(jnp.isnan(end.size), jnp.inf, end.size), jnp.nan),
         correction=relative_size(moved - fixed, fixed),
-        full_rank=end.regular,
+        full_rank=end.nonsingular,
         success=success,
     )
     return out, info
 
 
 def faults_of_start(info: ProjectionInfo) -> tuple[IntScalar, tuple[str, ...]]:
-    """The number of a message, and all of them."""
+    """Return the number of the message that applies, and all messages."""
     cause = jnp.where(info.full_rank, 2, 1)
     return jnp.where(jnp.isnan(info.residual), 0, cause), _FAULTS

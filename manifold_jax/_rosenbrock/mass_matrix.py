@@ -1,4 +1,4 @@
-"""`M y' = f`: the term, and its mass matrix in the forms that users give it."""
+"""The term `M y' = f`, and the forms in which users give its mass matrix."""
 
 from collections.abc import Callable
 from typing import Any, NoReturn
@@ -18,7 +18,7 @@ from .._base.user_functions import check_function
 from .._constraint.checks import check_state
 from .._constraint.diagnosis import Diagnosis
 from .._constraint.projection_info import ProjectionInfo
-from .algebraic import consistent, Equations, faults_of_start
+from .algebraic import consistent, faults_of_start, MassMatrixEquations
 
 
 class MassMatrixTerm(dfx.AbstractTerm):
@@ -30,7 +30,7 @@ class MassMatrixTerm(dfx.AbstractTerm):
 
     The left null space of `M` says which equations are algebraic: $u^T M = 0$ leaves
     $0 = u^T f(t, y)$. The index is 1 where these equations determine the part of `y` that `M` does
-    not see: where $M + P\, \partial f/\partial y$ is regular, with `P` the projector onto that null
+    not see: where $M + P\, \partial f/\partial y$ is nonsingular, with `P` the projector onto that null
     space. With a higher index (mechanics with constraints on positions, constraints of optimal
     control) reduce it first, for example with `mj.reduce_dae`.
 
@@ -38,10 +38,9 @@ class MassMatrixTerm(dfx.AbstractTerm):
 
     - `vector_field`: `f(t, y, args)`, of the structure of `y`. In an algebraic equation it is what
         has to be zero.
-    - `mass`: the matrix, or a callable `M(t, y, args)` that returns it: a scalar, the diagonal
-        (shape `(n,)`, or a pytree with the structure and shapes of `y`), or a matrix of shape
-        `(n, n)`, for the `n` numbers of `y` in the order of `jax.flatten_util.ravel_pytree`. Of
-        constant rank.
+    - `mass`: the matrix, or a callable `M(t, y, args)` that returns it: a scalar, the diagonal (shape
+        `(n,)`, or a pytree with the structure and shapes of `y`), or a matrix of shape `(n, n)`, for
+        the `n` numbers of `y` in the order of `jax.flatten_util.ravel_pytree`. Of constant rank.
 
     The initial value has to satisfy the algebraic equations. [`mj.diffeqsolve`][] sees to that
     (`consistent="project"` changes only what `M` does not see, `"check"` refuses); with
@@ -75,7 +74,7 @@ class MassMatrixTerm(dfx.AbstractTerm):
         return t1 - t0
 
     def prod(self, vf: Any, control: RealScalarLike) -> NoReturn:
-        """What solvers that do not know of mass matrices add to the state."""
+        """Return the increment for solvers that do not know of mass matrices."""
         raise ValueError(
             "`terms` is an `mj.MassMatrixTerm`, whose mass matrix this solver would ignore. Use `mj.Rodas5P()` or "
             "`mj.Rodas3P()`, alone or in `mj.Projected`. For another solver and a regular mass matrix solve for y' in "
@@ -103,18 +102,18 @@ class MassMatrixTerm(dfx.AbstractTerm):
         return _consistent_state(self, t, y, args, throw)
 
     def derivative(self, t: RealScalarLike, y: Y, args: Args = None) -> Y:
-        """`y'` at a consistent state; not finite where the index is above 1."""
+        """Return `y'` at a consistent state; not finite where the index is above 1."""
         x, unravel = jfu.ravel_pytree(y)
         return unravel(self.equations(y, args).at(t, x).derivative)
 
-    def equations(self, y: Y, args: Args) -> Equations:
-        """The equations in the vector of all numbers of the state; `y` is an example of one."""
+    def equations(self, y: Y, args: Args) -> MassMatrixEquations:
+        """Return the equations in the vector of all numbers of the state; `y` is an example of a state."""
         _, unravel = jfu.ravel_pytree(y)
 
         def field(t: RealScalarLike, x: Float[Array, " n"]) -> Float[Array, " n"]:
             return ravelled_like(y, self.vector_field(t, unravel(x), args))
 
-        return Equations(field, lambda t, x: mass_values(self.mass, t, unravel(x), args))
+        return MassMatrixEquations(field, lambda t, x: mass_values(self.mass, t, unravel(x), args))
 
 
 @clear_errors
@@ -134,7 +133,7 @@ def _consistent_state(
 
 
 def ravelled_like(y: Y, value: Any) -> Float[Array, " n"]:
-    """What a vector field returned, as a vector; refused if it is not like the state."""
+    """Return the result of a vector field as a vector; refuse one that is not like the state."""
     if not are_alike(value, y):
         raise ValueError(
             f"`vector_field` must return what `y` is made of, arrays of the shapes {shapes(y)}, got {shapes(value)}."
@@ -148,7 +147,7 @@ def _ravelled(y: Y, value: Any) -> Float[Array, " n"]:
 
 
 def mass_values(mass: Any, t: RealScalarLike, y: Y, args: Args) -> Float[Array, "..."]:
-    """A scalar, a diagonal `(n,)` or a matrix `(n, n)`."""
+    """Return the mass as a scalar, a diagonal `(n,)` or a matrix `(n, n)`."""
     if callable(mass):
         mass = mass(t, y, args)
         _check_numbers(mass)

@@ -23,8 +23,7 @@ from .tableau import RODAS3P, RODAS5P, RosenbrockTableau
 
 
 class RosenbrockInterpolation(dfx.AbstractLocalInterpolation):
-    """`(1 - s) y0 + s (y1 + (1 - s) (k_1 + s (k_2 + ...)))`, `s` running from 0 to 1 over the
-    step."""
+    """`(1 - s) y0 + s (y1 + (1 - s) (k_1 + s (k_2 + ...)))`, with `s` from 0 to 1 over the step."""
 
     t0: RealScalarLike
     t1: RealScalarLike
@@ -51,8 +50,8 @@ class RosenbrockInterpolation(dfx.AbstractLocalInterpolation):
 
 
 class RosenbrockState(eqx.Module):
-    """Carried from step to step: the size of the first step that was tried (the scale of time near
-    t = 0), `y'` where the mass matrix depends on the state, and whether the start can be used."""
+    """Carried from step to step: the size of the first step that was tried (the scale of time near t =
+    0), `y'` if the mass matrix depends on the state, and whether the start is consistent."""
 
     first_step: FloatScalar
     derivative: Float[Array, " n"] | None
@@ -60,12 +59,12 @@ class RosenbrockState(eqx.Module):
 
 
 class AbstractRosenbrock(dfx.AbstractAdaptiveSolver):
-    """Linearly implicit one-step methods: instead of equations to be iterated each stage has a
-    linear system, all with the matrix `M / gamma - h df/dy`, which is factored once per step."""
+    """Linearly implicit one-step methods: instead of nonlinear equations each stage has a linear
+    system. All have the same matrix `M / gamma - h df/dy`, which is factored once per step."""
 
     tableau: eqx.AbstractClassVar[RosenbrockTableau]
-    checks_start: bool = True  # not where the state has been made consistent before
-    # Number of rows up to which LAPACK does not factor.
+    checks_start: bool = True  # false if the state has been made consistent before
+    # Largest number of rows for which the elimination is written out, without LAPACK.
     largest_written_out: int = eqx.field(default=LARGEST_WRITTEN_OUT, static=True)
 
     term_structure: ClassVar = dfx.AbstractTerm
@@ -109,9 +108,9 @@ class AbstractRosenbrock(dfx.AbstractAdaptiveSolver):
         step = rosenbrock_step(self.tableau, system, x0, derivative, self.largest_written_out)
         finite = jnp.all(jnp.isfinite(step.x1)) & jnp.all(jnp.isfinite(step.error))
         result = RESULTS.where(finite, RESULTS.successful, RESULTS.nonfinite)  # pyright: ignore[reportArgumentType]
-        singular = step.defined & ~step.regular | ~solver_state.usable
+        singular = step.defined & ~step.nonsingular | ~solver_state.usable
         result = RESULTS.where(singular, nonlinear_failure(), result)
-        # No smaller step helps where the equations are not defined at its beginning.
+        # A smaller step does not help if the equations are not defined at its beginning.
         repeatable = is_repeatable(t0, t1, solver_state.first_step)
         repeatable &= step.defined & solver_state.usable
         usable = jnp.where(solver_state.usable, 0.0, jnp.nan).astype(x0.dtype)
@@ -136,7 +135,7 @@ class Rodas5P(AbstractRosenbrock):
     [`LocalCoordinates`][] and [`Stabilized`][] (without one). All adjoints work; derivatives
     are those of the steps, second derivatives of `f` included.
 
-    Order 5 is kept for non-autonomous equations, for `M y' = f` with constant or regular
+    The order is 5 for non-autonomous equations, for `M y' = f` with constant or nonsingular
     `M(t, y)` and for DAEs of index 1 with constant `M`; with a singular `M` that depends on time or
     state it is 3. Fast components that follow a forcing, $y' = \lambda (y - \varphi(t)) +
     \varphi'(t)$ (Prothero & Robinson), have errors of order $h^3 / |\lambda|$ while
@@ -162,7 +161,7 @@ class Rodas3P(AbstractRosenbrock):
     r"""Rosenbrock method of order 3 (error estimate of order 2, dense output 3) with five stages and
     three evaluations of the vector field, for loose tolerances; all else as [`Rodas5P`][].
 
-    Order 3 is kept as order 5 is by [`Rodas5P`][]; with a singular `M` that depends on time or
+    The order is 3 where that of [`Rodas5P`][] is 5; with a singular `M` that depends on time or
     state it is 2. Fast components that follow a forcing have errors of order $h^2 / |\lambda|$.
 
     Source: Steinebach, Rosenbrock methods within OrdinaryDiffEq.jl - Overview, recent developments

@@ -17,22 +17,22 @@ from .system import System, Vector
 from .tableau import RosenbrockTableau, Row
 
 
-# Equations of the vector field times stages. A loop over the stages of 6000 (transistor amplifier) and
-# 7600 equations (charge pump) takes 1.3 times as long in a batch, one of 20000 (wheelset) 0.75 times; that
-# compiles in 0.8 of the time. jaxlib 0.10.2.
+# Largest number of equations of the vector field times stages for which stages are written out. A loop
+# over the stages of 6000 (transistor amplifier) and 7600 equations (charge pump) takes 1.3 times as
+# long in a batch, one of 20000 (wheelset) 0.75 times; that compiles in 0.8 of the time. jaxlib 0.10.2.
 LARGEST_UNROLLED = 10_000
 
 
 class RosenbrockStep(NamedTuple):
-    """The state at the end, its error estimate, the rows of dense output, `y'` at the end if it is
-    carried; whether the equations are defined at the beginning, and the matrix regular."""
+    """The state at the end, its error estimate, the rows of dense output, and `y'` at the end if it is
+    carried; whether the equations are defined at the beginning, and the matrix nonsingular."""
 
     x1: Vector
     error: Vector
     dense: tuple[Vector, ...]
     derivative: Vector | None
     defined: BoolScalar
-    regular: BoolScalar
+    nonsingular: BoolScalar
 
 
 def rosenbrock_step(
@@ -42,7 +42,7 @@ def rosenbrock_step(
     derivative: Vector | None,
     largest_written_out: int,
 ) -> RosenbrockStep:
-    r"""One step. If `M` depends on time or state, the method is that for the larger system
+    r"""Make one step. If `M` depends on time or state, the method is applied to the larger system
     $y' = z$, $0 = f(t, y) - M(t, y) z$, with $z$ eliminated from its linear systems: with $Z_i$ for
     $h z$ at a stage, $V_i$ for its increments, and $J, T$ the derivatives of $f - M z_0$,
 
@@ -61,7 +61,7 @@ def rosenbrock_step(
     stages = _Stages(tableau, system, factor, x0, Z0, M0, T)
     U, V = stages.in_a_loop(f0) if stages.are_long else stages.written_out(f0)
     finite = [jnp.all(jnp.isfinite(value)) for value in (f0, J, T)]
-    # A finished lane of a batch makes steps of no length.
+    # A lane of a batch that has finished makes steps of length zero.
     after = None if Z0 is None else _plus(Z0, tableau.m, V) / jnp.where(h == 0, 1, h)
     return RosenbrockStep(
         _plus(x0, tableau.m, U),
@@ -69,12 +69,12 @@ def rosenbrock_step(
         tuple(_plus(None, weights, U) for weights in tableau.dense),
         after,
         finite[0] & finite[1] & finite[2],
-        factor.full_rank,
+        factor.usable,
     )
 
 
 class _Stages(NamedTuple):
-    """What the stages of one step share."""
+    """The quantities that the stages of one step share."""
 
     tableau: RosenbrockTableau
     system: System
@@ -90,7 +90,7 @@ class _Stages(NamedTuple):
         return increment * len(self.tableau.c) > LARGEST_UNROLLED
 
     def evaluate(self, t: Array, x: Vector) -> tuple[Vector, Any]:
-        """`h f` and `M`."""
+        """Return `h f` and `M`."""
         constant = self.Z0 is None
         M = self.M0 if constant else self.system.mass_at(t, x)
         return self.system.increment(t, x), M
@@ -98,7 +98,7 @@ class _Stages(NamedTuple):
     def solve(
         self, f: Vector, M: Any, d: Any, coupling: Vector | None, Z: Vector | None
     ) -> tuple[Vector, Vector | None]:
-        """`U_i` and `V_i`."""
+        """Return `U_i` and `V_i`."""
         right = f if isinstance(d, float) and d == 0 else f + d * self.T
         if coupling is not None:
             right = right + (coupling if self.M0 is None else product(self.M0, coupling))
@@ -125,7 +125,7 @@ class _Stages(NamedTuple):
         return U, V
 
     def in_a_loop(self, f0: Vector) -> tuple[list[Vector], list[Any]]:
-        """The same with the vector field compiled once, whatever the number of stages."""
+        """Compute the same with the vector field compiled once, whatever the number of stages."""
         tableau, count = self.tableau, len(self.tableau.c)
         dtype = self.x0.dtype
 
@@ -149,14 +149,14 @@ class _Stages(NamedTuple):
 
 
 def _without_zeros(row: Row) -> Row:
-    """Also at its end, so that equal stages are recognized."""
+    """Drop zeros, also at the end, so that equal stages are recognized."""
     while row and row[-1] == 0:
         row = row[:-1]
     return row
 
 
 def _plus(start: Vector | None, row: Row, vectors: list[Vector]) -> Any:
-    """`start` and the combination of those vectors that have a coefficient."""
+    """Return `start` plus the combination of those vectors whose coefficient is not zero."""
     total = start
     for c, v in zip(row, vectors, strict=False):
         if c != 0:

@@ -1,4 +1,4 @@
-"""What one step of a Rosenbrock method solves, in the vector of all numbers of the state."""
+"""The equations of one Rosenbrock step, for the vector of all numbers of the state."""
 
 from typing import Any, NamedTuple
 
@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 from .._base.compat import directed, time_direction, undirected
 from .._base.types import Args, RealScalarLike, Y
 from .._linalg.rows import product
-from .algebraic import Linearized
+from .algebraic import LinearizedEquations
 from .mass_matrix import mass_values, MassMatrixTerm, ravelled_like
 
 
@@ -21,8 +21,8 @@ Vector = Float[Array, " n"]
 class System(NamedTuple):
     """`M y' = f` over one step from `t0` to `t1`.
 
-    - `terms`: those of `f` alone.
-    - `mass`: the mass matrix, or `None` for one of ones.
+    - `terms`: the terms of `f` alone.
+    - `mass`: the mass matrix, or `None` for the identity.
     """
 
     terms: Any
@@ -48,7 +48,7 @@ class System(NamedTuple):
         return self.t0 + c * self.step
 
     def increment(self, t: RealScalarLike, x: Vector) -> Vector:
-        """`h f(t, x)`."""
+        """Return `h f(t, x)`."""
         control = self.terms.contr(self.t0, self.t1)
         value = self.terms.vf_prod(t, self._unravel(x), self.args, control)
         return ravelled_like(self.y0, value)
@@ -62,7 +62,7 @@ class System(NamedTuple):
     def linearized(
         self, x0: Vector, displacement: Vector | None
     ) -> tuple[Vector, Float[Array, "n n"], Vector]:
-        """`h f`, its Jacobian and `h` times its derivative by time at the beginning; if the mass
+        """Return `h f`, its Jacobian and `h` times its derivative by time at the beginning; if the mass
         depends on the state, the derivatives are those of `h f - M displacement`."""
 
         def rest(t: RealScalarLike, x: Vector) -> tuple[Vector, Vector]:
@@ -77,15 +77,14 @@ class System(NamedTuple):
         _, T = jax.jvp(lambda t: rest(t, x0)[0], (t0,), (self.step.astype(t0.dtype),))
         return f0, J, T
 
-    def at_start(self, x0: Vector) -> tuple[Linearized, Vector]:
-        """The equations with their mass matrix at the beginning, and `y'` in the direction of the
-        step."""
+    def at_start(self, x0: Vector) -> tuple[LinearizedEquations, Vector]:
+        """Return the equations and the mass matrix at the beginning, and `y'` in the step's direction."""
         direction = time_direction(self.terms)
         at = self.mass.equations(self.y0, self.args).at(self.t0 * direction, x0)  # pyright: ignore
         return at, at.derivative * jnp.asarray(direction, x0.dtype)
 
     def refreshed(self, made_jump: Any, derivative: Vector | None, x0: Vector) -> Vector | None:
-        """The carried derivative `y'`, computed anew behind a jump of the field."""
+        """Return the carried derivative `y'`, evaluated again after a jump of the field."""
         if derivative is None or made_jump is False:
             return derivative
         return jax.lax.cond(made_jump, lambda: self.at_start(x0)[1], lambda: derivative)

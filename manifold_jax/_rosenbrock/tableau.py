@@ -7,7 +7,7 @@ Row = tuple[float, ...]
 
 
 class RosenbrockTableau(NamedTuple):
-    r"""Coefficients in the form that multiplies no stage by the Jacobian (Hairer & Wanner, Solving
+    r"""Coefficients in the form without products of stages and the Jacobian (Hairer & Wanner, Solving
     ODEs II, IV.7.25 and VI.4): with $J = \partial f/\partial y$ and $T = \partial f/\partial t$ at the
     beginning of a step
 

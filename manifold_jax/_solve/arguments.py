@@ -1,4 +1,4 @@
-"""Arguments of `mj.diffeqsolve` that cannot work, refused with what to write instead."""
+"""Checks of the arguments of `mj.diffeqsolve`; messages say what to write instead."""
 
 import functools
 import inspect
@@ -76,7 +76,7 @@ def check_max_steps(max_steps: Any) -> None:
 
 
 def explained(function: Function) -> Function:
-    """Wrap a solve: of an error in it that comes from a vector field unlike the state, say so."""
+    """Wrap a solve: explain errors in it that come from a vector field unlike the state."""
     signature = inspect.signature(function)
 
     @functools.wraps(function)
@@ -95,16 +95,16 @@ def explained(function: Function) -> Function:
 
 
 def fault_of_field(terms: Any, t0: Any, y0: Any, args: Any) -> str | None:
-    """What to say of a vector field of another shape than the state."""
+    """Return the message for a vector field of another shape than the state."""
     if not isinstance(terms, dfx.ODETerm):
         return None
     try:
         field = eqx.filter_eval_shape(terms.vector_field, t0, y0, args)
-    except Exception:  # which is the error itself
+    except Exception:  # the error itself
         return None
     shapes = [[jnp.shape(leaf) for leaf in jtu.tree_leaves(tree)] for tree in (field, y0)]
     if jtu.tree_structure(field) != jtu.tree_structure(y0) or shapes[0] == shapes[1]:
-        return None  # Diffrax speaks of other structures
+        return None  # Diffrax reports other structures
     got, state = (jtu.tree_map(jnp.shape, tree) for tree in (field, y0))
     return (
         f"The vector field in `terms` must be like the state, of shape {state}, but returns {got}: one velocity for "
@@ -156,15 +156,14 @@ def _check_kind(name: str, value: Any, kind: type, example: str) -> None:
 
 
 def without_idle_hook(solver: Any, t0: RealScalarLike, y0: Y, args: Args) -> Any:
-    """The solver alone where its hook has no equations to keep, as systems that are reduced or
-    generated may have none."""
+    """Return the inner solver if its hook has no equations, as reduced or generated systems may have."""
     if not isinstance(solver, AbstractManifoldSolver):
         return solver
     return solver.inner if has_no_equations(solver.constraint, t0, y0, args) else solver
 
 
 def warn_of_rounding(y0: Y, time: Any, controller: Any) -> None:
-    """Tolerances that are known, and below what numbers of 32 bits can tell apart."""
+    """Warn of tolerances, if known, that are below the resolution of 32-bit numbers."""
     tolerances = controller_tolerances(controller)
     if tolerances is None or not all(
         isinstance(x, int | float) for x in (tolerances.rtol, tolerances.atol)

@@ -1,4 +1,4 @@
-"""The front end: `diffrax.diffeqsolve` plus what a solver cannot do by itself."""
+"""The front end: `diffrax.diffeqsolve` plus what a solver cannot do on its own."""
 
 from typing import Any
 
@@ -59,17 +59,16 @@ def diffeqsolve(
     """Solve a differential equation on a manifold.
 
     Takes the arguments of `diffrax.diffeqsolve` and returns its `Solution`. In addition the
-    initial value is made consistent, and every value returned is on the manifold: saved
-    values, the dense solution `sol.evaluate`, what `SaveAt(fn=...)` and event functions see,
-    and the state at an event.
+    initial value is made consistent, and every value returned is on the manifold: saved values, the
+    dense solution `sol.evaluate`, the arguments of `SaveAt(fn=...)` and of event functions, and the
+    state at an event.
 
     **Arguments:** as `diffrax.diffeqsolve`, and
 
-    - `solver`: [`Projected`][] or another solver of this library; with a constraint of no equations the
-        solver inside it, alone. (Any other Diffrax solver
-        is passed on, for comparisons; implicit stages are solved to round-off there, too.)
-        [`Rodas5P`][] and [`Rodas3P`][], alone or wrapped, for stiff equations; they take a
-        [`MassMatrixTerm`][].
+    - `solver`: [`Projected`][] or another solver of this library; if its constraint has no equations the
+        solver inside it is used alone. (Any other solver of Diffrax is used as it is, for comparisons,
+        also with implicit stages solved to round-off.) [`Rodas5P`][] and [`Rodas3P`][], alone or
+        wrapped, for stiff equations; they take a [`MassMatrixTerm`][].
     - `dt0`: `None` with an adaptive controller chooses the first step from the vector field
         (Hairer, Norsett & Wanner, Solving ODEs I, II.4).
     - `consistent`: what to do with `y0`. `"project"` moves it onto the manifold, `"check"`
@@ -77,33 +76,32 @@ def diffeqsolve(
         algebraic equations of a [`MassMatrixTerm`][], which is checked to half of the digits.
     - `event`: event functions get the true time, also when integrating backwards. With a root
         finder the earliest event ends the solve, whatever the order of `cond_fn`.
-    - `adjoint`: how derivatives are computed, by default in both modes by
-        [`StepReplayAdjoint`][], from the very steps that were made. Diffrax's other adjoints compute steps again, which round
-        differently and get other sizes: where tolerances are tight their gradients are less
-        accurate than the solution.
+    - `adjoint`: how derivatives are computed, by default in both modes by [`StepReplayAdjoint`][], from
+        the steps that were made. Diffrax's own adjoints compute steps again, which round differently
+        and get other sizes: with tight tolerances their gradients are less accurate than the solution.
 
-    Real numbers of Python in `y0` and `args`, and all in `t0`, `t1` and `dt0`, become arrays: other
-    values are not compiled again. Whole numbers in `args`, which may be shapes, and tolerances are part of
-    the compiled program; pass `jnp.asarray(...)` where they vary.
+    Python floats in `y0` and `args`, and all numbers in `t0`, `t1` and `dt0`, become arrays: other values do
+    not cause another compilation. Integers in `args`, which may be shapes, and tolerances are part of the
+    compiled program; pass `jnp.asarray(...)` if they vary.
 
     **Returns:**
 
     A `diffrax.Solution`; `sol.stats` has in addition
 
-    - `initial_correction`: how far `y0` was moved, the largest `|change| / (|y0| + 1)`;
+    - `initial_correction`: the distance by which `y0` was moved, the largest `|change| / (|y0| + 1)`;
     - `num_projection_iterations`: Newton iterations over all accepted steps;
     - `largest_correction`: the largest such correction of an accepted step;
-    - `correction_share`: with [`Projected`][] the part of the steps that the corrections undid,
-        their sum over that of the displacements. Where the field is tangent it is as small as the
-        tolerance; if it is not, see [`tangent_field`][].
+    - `correction_share`: with [`Projected`][] the fraction of the steps that the corrections undid,
+        their sum over that of the displacements. For a tangent field it is as small as the tolerance;
+        otherwise see [`tangent_field`][].
 
     **Raises:**
 
-    `TypeError` or `ValueError` for arguments that cannot work. With `throw=True` a
-    `RuntimeError` where the solve fails; with `throw=False` look at `sol.result`:
-    `RESULTS.nonlinear_divergence` is a constraint that could not be satisfied, or is NaN where it is
-    evaluated, `RESULTS.nonfinite_input` a time that is NaN, and `RESULTS.nonfinite` a state that is NaN or
-    infinite otherwise, with a constant step size also for a solver of Diffrax alone.
+    `TypeError` or `ValueError` for invalid arguments. With `throw=True` a `RuntimeError` if the solve
+    fails; with `throw=False` look at `sol.result`: `RESULTS.nonlinear_divergence` means that a constraint
+    could not be satisfied or was NaN, `RESULTS.nonfinite_input` that a time was NaN, and
+    `RESULTS.nonfinite` that a state became NaN or infinite otherwise, with a constant step size also for
+    a solver of Diffrax alone.
 
     Source: Sudarsan & Keerthi, Appl. Math. Comput. 92 (1998) 153-193.
     """
@@ -142,7 +140,7 @@ def diffeqsolve(
         controller_state=controller_state,
         made_jump=made_jump,
     )
-    # The dense solution, which is returned, holds the constraint that was given.
+    # The dense solution, which is returned, holds the original constraint.
     return finish(setup, ready, sol, constraint)
 
 
@@ -153,9 +151,9 @@ def _as_in_steps(
     consistent: Consistent,
     y0: Y,
 ) -> Any:
-    """The solver as it runs: with the tolerances of the controller, and accurate implicit stages."""
+    """Return the solver with the tolerances of the controller, and accurate implicit stages."""
     if isinstance(solver, AbstractManifoldSolver):
-        # Every value that is interpolated is corrected, but for those that an event is searched by.
+        # All interpolated values are corrected, except those with which an event is searched for.
         solver = solver.within(controller, bends_interpolant=event is not None)
     else:
         warn_of_unknown_hook(solver)

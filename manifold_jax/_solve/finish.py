@@ -1,4 +1,4 @@
-"""What is done after the loop: output on the manifold, statistics, and the result."""
+"""Postprocessing of a solve: output on the manifold, statistics, and the result."""
 
 from typing import Any
 
@@ -20,14 +20,14 @@ from .setup import Setup
 def finish(
     setup: Setup, ready: Ready, sol: dfx.Solution, constraint: AbstractConstraint | None
 ) -> dfx.Solution:
-    """Correct what was saved, and report; with `throw` raise what went wrong. `constraint` is held
-    by the dense solution."""
+    """Correct the saved values and report the solve; with `throw` raise if it failed. `constraint` is
+    held by the dense solution."""
     is_hook = isinstance(setup.solver, AbstractManifoldSolver)
     report = _corrected(setup, ready, sol, constraint) if is_hook else _checked(setup, ready, sol)
     if not setup.throw:
         return report
     faults = tangency_fault(setup.solver, report, sol.solver_state)
-    # A bad start has raised its own, clearer error.
+    # A bad start has raised its own, more precise error.
     failed = ~is_okay(report.result) & ready.start.success
     return raise_if_failed(report, failed, setup.solver, faults)
 
@@ -36,7 +36,7 @@ def _corrected(setup: Setup, ready: Ready, sol: dfx.Solution, constraint: Any) -
     solver, saveat, (_, _, y0, args) = setup.solver, setup.saveat, ready.data
     statistics = sol.solver_state.statistics  # pyright: ignore[reportOptionalMemberAccess]
     ys, failed = project_output(setup, ready.data, sol.ts, sol.ys)
-    # Diffrax forgets that a step failed if it has an event, too.
+    # Diffrax forgets that a step failed if the solve also has an event.
     result = update_result(sol.result, sol.solver_state.result)  # pyright: ignore[reportOptionalMemberAccess]
     result = update_result(result, RESULTS.where(failed, nonlinear_failure(), RESULTS.successful))
     if not solver.corrects_output:
@@ -66,7 +66,7 @@ def _corrected(setup: Setup, ready: Ready, sol: dfx.Solution, constraint: Any) -
 
 
 def _checked(setup: Setup, ready: Ready, sol: dfx.Solution) -> dfx.Solution:
-    """What Diffrax returns, except that a state that is not finite is no success."""
+    """Return Diffrax's result, except that a state that is not finite is a failure."""
     result = update_result(sol.result, result_of_saved(saving(setup), sol.ts, sol.ys))
     ts, ys = sol.ts, sol.ys
     if not saves_state(setup.saveat):

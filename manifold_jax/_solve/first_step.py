@@ -1,4 +1,4 @@
-"""A sensible first step of an adaptive solve."""
+"""The first step size of an adaptive solve."""
 
 from typing import Any, NamedTuple
 
@@ -13,7 +13,7 @@ from .setup import ProblemData
 
 
 class FirstStep(NamedTuple):
-    """Its size, signed like `t1 - t0`, and the vector field at the start, as `terms.vf` returns it."""
+    """The step size, signed like `t1 - t0`, and the vector field at the start, as of `terms.vf`."""
 
     size: FloatScalar
     field: Any
@@ -22,15 +22,15 @@ class FirstStep(NamedTuple):
 def first_step(
     terms: Any, solver: dfx.AbstractSolver, data: ProblemData, controller: dfx.PIDController
 ) -> FirstStep:
-    """First step of an adaptive solve of an ODE.
+    """Choose the first step size of an adaptive solve of an ODE.
 
-    Diffrax has such an estimate but never reaches it and starts with 0.01 whatever the
-    problem. Two evaluations of the vector field give its size `d1` and its rate of change
-    `r = d2 / d1`, in the controller's norm; the step solves `d1 h (r h)^p = 1/100`, so that
-    it does not depend on the unit of time.
+    Diffrax has such an estimate but never uses it, and starts with 0.01 whatever the problem. Two
+    evaluations of the vector field give its size `d1` and its rate of change `r = d2 / d1`, in the
+    controller's norm; the step solves `d1 h (r h)^p = 1/100`, so that it does not depend on the unit of
+    time.
 
-    Source: after Hairer, Norsett & Wanner, Solving ODEs I, section II.4 (starting step
-    size), whose last formula depends on that unit.
+    Source: after Hairer, Norsett & Wanner, Solving ODEs I, section II.4 (starting step size), whose
+    last formula depends on that unit.
     """
     t0, t1, y0, args = data
     t0, t1 = jnp.asarray(t0), jnp.asarray(t1)
@@ -43,11 +43,11 @@ def first_step(
         return jnp.asarray(controller.norm(jtu.tree_map(lambda a, s: a / s, v, scale)), t0.dtype)
 
     span = jnp.abs(t1 - t0)
-    span = jnp.where(jnp.isfinite(span), span, 1.0)  # solved until an event
+    span = jnp.where(jnp.isfinite(span), span, 1.0)  # infinite if solved until an event
     d0 = norm(start)
 
     def trial(velocity: Y) -> tuple[BoolScalar, FloatScalar, FloatScalar]:
-        """Whether the velocity is too small to say anything, its size otherwise, a trial step."""
+        """Return whether the velocity is too small for an estimate, else its size, and a trial step."""
         d1 = norm(velocity)
         small = (d0 < 1e-5) | (d1 < 1e-5)
         d1 = jnp.where(small, 1.0, d1)
@@ -61,7 +61,7 @@ def first_step(
         y = jtu.tree_map(lambda y, f: y + (step * f).astype(y.dtype), start, velocity)
         return (t0 + step, y), (field, velocity)
 
-    # In a loop, of which a program has one vector field, not two.
+    # In a loop, so that the program contains one vector field instead of two.
     _, (fields, velocities) = jax.lax.scan(evaluate, (t0, y0), None, length=2)
     f0, f1 = (jtu.tree_map(lambda v, i=i: v[i], velocities) for i in (0, 1))
     small, d1, h0 = trial(f0)
@@ -69,7 +69,7 @@ def first_step(
     power = 1 / (order + 1)  # pyright: ignore[reportOptionalOperand]
     h1 = (0.01 / d1) ** power * rate ** (-order * power)  # pyright: ignore[reportOptionalOperand]
     h = jnp.where(small, h0, jnp.minimum(100 * h0, h1))
-    # A vector field that is not finite near the start says nothing about the step.
+    # A vector field that is not finite near the start gives no estimate.
     h = jnp.where(jnp.isfinite(h) & (h > 0), h, 1e-3 * span)
     h = jax.lax.stop_gradient(direction * jnp.minimum(h, span))
     return FirstStep(h, jtu.tree_map(lambda f: f[0], fields))

@@ -14,8 +14,8 @@ from .setup import Consistent, ProblemData, Setup
 
 
 def consistent_with_mass(setup: Setup, data: ProblemData) -> tuple[Y, FloatScalar | None]:
-    """The state to start from, and how far it was moved (`None` without a mass matrix). With `throw`
-    the error that names the cause is attached to it; otherwise the first step fails for it."""
+    """Return the state to start from, and how far it was moved (`None` without a mass matrix). With
+    `throw` the error that names the cause is attached to the state; otherwise the first step fails."""
     terms, (t0, _, y0, args) = setup.terms, data
     if not isinstance(terms, MassMatrixTerm) or setup.consistent == "assume":
         return y0, None
@@ -32,7 +32,7 @@ def consistent_with_mass(setup: Setup, data: ProblemData) -> tuple[Y, FloatScala
 
 
 def trusting(solver: Any, consistent: Consistent) -> Any:
-    """The solver, without its own check of the start where that is to be trusted."""
+    """Return the solver without its own check of the start, if that is to be trusted."""
     is_rosenbrock = lambda x: isinstance(x, AbstractRosenbrock)
     if consistent != "assume":
         return solver

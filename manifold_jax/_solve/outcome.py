@@ -1,4 +1,4 @@
-"""How a solve ended: what is no success although Diffrax calls it one, and the message of a failure."""
+"""The result of a solve: failures that Diffrax reports as success, and messages of failures."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -16,7 +16,7 @@ from .._constraint.settings import NewtonProjection
 from .._rosenbrock import AbstractRosenbrock
 from .._solver import Projected
 from .._solver.base import AbstractManifoldSolver
-from .._solver.step.advance import StepStatistics
+from .._solver.step.hook_state import StepStatistics
 
 
 _NOT_CORRECTED = (
@@ -63,7 +63,7 @@ _NOT_TANGENT = (
 
 
 def result_of_saved(saveat: dfx.SaveAt, ts: Any, ys: Any) -> RESULTS:
-    """`RESULTS.nonfinite` where a saved state is NaN or infinite at a time that was reached."""
+    """Return `RESULTS.nonfinite` if a saved state is NaN or infinite at a time that was reached."""
     finite = jnp.asarray(True)
 
     def check(sub: dfx.SubSaveAt, ts: Array, ys: Any) -> None:
@@ -79,7 +79,7 @@ def result_of_saved(saveat: dfx.SaveAt, ts: Any, ys: Any) -> RESULTS:
 
 
 def messages_for(solver: dfx.AbstractSolver) -> list[str]:
-    """What the result codes of a solve mean, by number, instead of what Diffrax says."""
+    """Return the messages of the result codes, by number, with more detail than those of Diffrax."""
     messages = messages_of_results()
     texts = [(RESULTS.max_steps_reached, _TOO_MANY), (RESULTS.nonfinite, _NOT_FINITE)]
     texts.append((RESULTS.nonfinite_input, _NAN_INSIDE))
@@ -99,7 +99,7 @@ def is_unusable_start(number: Any, num_steps: Any) -> Any:
 
 
 def is_without_time(number: Any, num_steps: Any) -> Any:
-    """The same for a time that is NaN."""
+    """Whether a trajectory failed because a time is NaN, from the number of its result code."""
     code = number_of_result(RESULTS.nonfinite_input)  # pyright: ignore[reportArgumentType]
     return (number == code) & (num_steps == 0)
 
@@ -107,7 +107,8 @@ def is_without_time(number: Any, num_steps: Any) -> Any:
 def tangency_fault(
     solver: dfx.AbstractSolver, sol: dfx.Solution, state: Any
 ) -> list[tuple[BoolScalar, str]]:
-    """What to say of too many steps, and where it applies. `state` is that of the hook at the end."""
+    """Return whether too many steps were taken because the field is not tangent, and the message.
+    `state` is that of the hook at the end."""
     if not isinstance(solver, Projected):
         return []
     undone = _undo_steps(state.statistics, sol.stats["num_accepted_steps"], solver.projection)
@@ -117,11 +118,11 @@ def tangency_fault(
 def _undo_steps(
     statistics: StepStatistics, num_accepted_steps: IntScalar, projection: NewtonProjection
 ) -> BoolScalar:
-    """Whether the corrections took back more of the steps than they do for tangent fields.
+    """Whether the corrections undid more of the steps than they do for tangent fields.
 
-    There they are as small as errors: over the gallery with tolerances from 1e-8 to 1e-3 up to 7
-    times the tolerance per length travelled. If a part of the field is normal, they are that part
-    of the length whatever the tolerance.
+    There they are as small as errors: over the gallery with tolerances from 1e-8 to 1e-3 up to 7 times
+    the tolerance per length travelled. If a part of the field is normal, they are that part of the
+    length whatever the tolerance.
     """
     dtype = statistics.correction.dtype
     share = jnp.asarray(1e-2, dtype)
@@ -143,5 +144,5 @@ def raise_if_failed(
     for fault, message in faults:
         number = jnp.where(fault, len(messages), number)
         messages.append(message)
-    # Of a batch the largest number is reported.
+    # For a batch the largest number is reported.
     return eqx.branched_error_if(sol, failed, jnp.where(failed, number, 0), messages)

@@ -1,4 +1,4 @@
-"""Everything returned between steps: saved values, user functions and events, on the manifold."""
+"""Output on the manifold: saved values, user functions and events."""
 
 from collections.abc import Callable
 from typing import Any
@@ -17,9 +17,8 @@ from .prepare import Ready
 from .setup import ProblemData, Setup
 
 
-# Outputs up to which they are corrected one by one, in a program that compiles in two thirds of the
-# time; of 1001 the pendulum's take 1.2 us more each than all at once. `python -m
-# benchmarks.speed.compile_time`.
+# Largest number of outputs that are corrected one by one, in a program that compiles in two thirds of
+# the time; with 1001 of the pendulum each takes 1.2 us more. `python -m benchmarks.speed.compile_time`.
 MOST_ONE_BY_ONE = 128
 
 
@@ -28,7 +27,8 @@ def _is_sub(x: Any) -> bool:
 
 
 def _is_interpolated(sub: dfx.SubSaveAt, event: dfx.Event | None) -> bool:
-    """Steps end on the manifold; interpolated values, also those at an event, do not."""
+    """Whether values are interpolated, also that at an event. Only these need a correction: steps end
+    on the manifold."""
     return sub.ts is not None or event is not None
 
 
@@ -38,12 +38,11 @@ def saves_state(saveat: dfx.SaveAt) -> bool:
 
 
 def saving(setup: Setup) -> dfx.SaveAt:
-    """What Diffrax is asked to save.
+    """Return the `SaveAt` for Diffrax.
 
-    The state itself is corrected after the solve, which is cheaper than in Diffrax's loop over
-    outputs; only a user's function has to see corrected states on the way.
-    The state of a hook is always kept, for the statistics in it. Without a hook the last state is
-    saved in any case, to see whether it is finite.
+    The state itself is corrected after the solve, which is cheaper than in Diffrax's loop over outputs;
+    only a user's function has to see corrected states inside it. The state of a hook is always kept,
+    for its statistics. Without a hook the last state is saved in any case, to check that it is finite.
     """
     saveat, solver = setup.saveat, setup.solver
     replaced = lambda where, value: eqx.tree_at(where, saveat, value, is_leaf=lambda x: x is None)
@@ -68,11 +67,10 @@ def saving(setup: Setup) -> dfx.SaveAt:
 
 
 def events_in_true_time(setup: Setup, ready: Ready) -> dfx.Event | None:
-    """Events that see the true time.
+    """Return the event with functions that get the true time.
 
-    Diffrax hands an event function negated times when integrating backwards; with the
-    original terms and times it is consistent again. States at the ends of steps are on the
-    manifold.
+    Diffrax passes negated times to an event function when integrating backwards; with the original
+    terms and times it is consistent again. States at the ends of steps are on the manifold.
     """
     event, data = setup.event, ready.data
     if event is None:
@@ -88,7 +86,7 @@ def events_in_true_time(setup: Setup, ready: Ready) -> dfx.Event | None:
 
 
 def project_output(setup: Setup, data: ProblemData, ts: Any, ys: Any) -> tuple[Any, BoolScalar]:
-    """The saved values, corrected; and whether any of them could not be."""
+    """Return the saved values, corrected, and whether any of them could not be corrected."""
     solver, failed = setup.solver, jnp.asarray(False)
     if not solver.corrects_output:
         return ys, failed
@@ -116,10 +114,10 @@ def project_output(setup: Setup, data: ProblemData, ts: Any, ys: Any) -> tuple[A
 def _corrected(
     solver: AbstractManifoldSolver, t: Array, y: Y, y0: Y, args: Args
 ) -> tuple[Y, BoolScalar]:
-    """One saved value, corrected, and whether that failed.
+    """Return one saved value, corrected, and whether that failed.
 
-    Entries that were not reached hold infinity and stay so. They are replaced before the
-    projection, not after it, as the derivative of a NaN is never zero.
+    Entries that were not reached hold infinity and stay so. They are replaced before the projection,
+    not after it, as the derivative of a NaN is never zero.
     """
     used = jnp.isfinite(t)
     y = jtu.tree_map(lambda a, b: jnp.where(used, a, b), y, y0)

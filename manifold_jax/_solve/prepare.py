@@ -1,4 +1,4 @@
-"""What is done before the loop: types, the initial value, and the first step."""
+"""Preparation of a solve: types, the initial value, and the first step."""
 
 from typing import Any, NamedTuple
 
@@ -12,8 +12,8 @@ from .._constraint.checks import check_constraint, check_state
 from .._constraint.constraint import NoConstraint
 from .._rosenbrock import AbstractRosenbrock, MassMatrixTerm
 from .._solver.base import AbstractManifoldSolver, controller_tolerances
-from .._solver.step.advance import HookState
 from .._solver.step.execution import ExplicitStep
+from .._solver.step.hook_state import HookState
 from .._solver.terms import DirectedTerm
 from .._solver.unconstrained import Unconstrained
 from .first_step import first_step, FirstStep
@@ -23,8 +23,8 @@ from .start import start_state, StartInfo
 
 
 class Ready(NamedTuple):
-    """What a loop starts from; all times in one type of number. The state of the solver, where it
-    is known without `solver.init`."""
+    """The initial values of a loop, with all times of one dtype, and the state of the solver if it is
+    known without `solver.init`."""
 
     data: ProblemData
     dt0: RealScalarLike | None
@@ -45,7 +45,7 @@ def prepare(setup: Setup, data: ProblemData) -> Ready:
     if dt0 is None and (first := _chosen_first_step(setup, data)):
         dt0 = first.size
         solver_state = _solver_state(setup, data, first)
-    if not setup.throw:  # what starts with NaN ends before its first step
+    if not setup.throw:  # a solve from NaN ends before its first step
         y0 = jtu.tree_map(lambda leaf: jnp.where(start.success, leaf, jnp.nan), y0)
     return Ready(data._replace(y0=y0), dt0, solver_state, start)
 
@@ -64,7 +64,7 @@ def _start(setup: Setup, data: ProblemData) -> tuple[Y, StartInfo]:
 
 
 def time_dtype(t0: Any, t1: Any, dt0: Any, saveat: dfx.SaveAt) -> Any:
-    """The type in which Diffrax will hold times, and the least precision of the state."""
+    """Return the dtype in which Diffrax will hold times; that of states is at least as precise."""
     subs = jtu.tree_leaves(saveat.subs, is_leaf=lambda x: isinstance(x, dfx.SubSaveAt))
     times = [t for t in (t0, t1, dt0, *(s.ts for s in subs)) if t is not None]
     with jax.numpy_dtype_promotion("standard"):
@@ -82,7 +82,7 @@ def _chosen_first_step(setup: Setup, data: ProblemData) -> FirstStep | None:
     terms, tolerances = setup.terms, controller_tolerances(setup.controller)
     inner = getattr(setup.solver, "inner", setup.solver)
     if isinstance(setup.solver, Unconstrained) and not isinstance(inner, AbstractRosenbrock):
-        return None  # as Diffrax chooses it
+        return None  # left to Diffrax
     if isinstance(terms, MassMatrixTerm):
         terms = dfx.ODETerm(terms.derivative)
     if tolerances is None or not isinstance(terms, dfx.ODETerm | DirectedTerm):
@@ -91,7 +91,8 @@ def _chosen_first_step(setup: Setup, data: ProblemData) -> FirstStep | None:
 
 
 def _solver_state(setup: Setup, data: ProblemData, first: FirstStep) -> HookState | None:
-    """What `solver.init` would evaluate the vector field for once more, if it is that of `terms`."""
+    """Return the state of the solver from the vector field `f0` of `terms`, which `solver.init` would
+    evaluate again."""
     terms, solver, (t0, _, y0, args) = setup.terms, setup.solver, data
     if not isinstance(solver, AbstractManifoldSolver) or solver.prepare_terms(terms) is not terms:
         return None

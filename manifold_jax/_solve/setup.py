@@ -1,4 +1,4 @@
-"""What is to be solved, and how: records that are built once, where a function of the library is called."""
+"""Records of a problem and of the settings of a solve, built once in each public function."""
 
 from typing import Any, Literal, NamedTuple, TypeAlias
 
@@ -12,7 +12,7 @@ Consistent: TypeAlias = Literal["project", "check", "assume"]
 
 
 class ProblemData(NamedTuple):
-    """What one trajectory is defined by."""
+    """The data that define one trajectory."""
 
     t0: Any  # a real number, as `t1`
     t1: Any
@@ -26,7 +26,7 @@ class ProblemData(NamedTuple):
 
 
 class Setup(NamedTuple):
-    """How trajectories are solved: the arguments of `diffeqsolve` with these names."""
+    """The settings of a solve: the arguments of `diffeqsolve` with these names."""
 
     terms: Any
     solver: Any

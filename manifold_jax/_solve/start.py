@@ -14,14 +14,14 @@ from .setup import ProblemData, Setup
 
 
 class StartInfo(NamedTuple):
-    """How an initial value was treated: the change made, and whether the value can be used."""
+    """Report of the treatment of an initial value: the change made, and whether the value can be used."""
 
     correction: FloatScalar
     success: BoolScalar
 
 
 def start_state(setup: Setup, data: ProblemData) -> tuple[Y, StartInfo]:
-    """The state to start from. With `throw` the error that names the cause is attached to it."""
+    """Return the state to start from. With `throw` the error that names the cause is attached to it."""
     (t0, _, y0, args), consistent = data, setup.consistent
     constraint, projection = setup.solver.constraint, setup.solver.projection
     if consistent == "assume":

@@ -1,4 +1,4 @@
-"""Times that are no times: NaN is neither before nor after anything, and would end a solve at once."""
+"""Times that are NaN: neither before nor after any other time, they would end a solve at once."""
 
 import functools
 import inspect
@@ -29,7 +29,7 @@ _NO_END = "`t1` is NaN: it must be a number, or infinite if an event ends the so
 
 
 def checking_first_step(function: Function) -> Function:
-    """Wrap a solve whose numbers become arrays: refuse a first step that is known to be none."""
+    """Wrap a solve whose numbers become arrays: refuse a first step that is known to be unusable."""
     place = list(inspect.signature(function).parameters).index("dt0")
 
     @functools.wraps(function)
@@ -55,8 +55,7 @@ def is_no_step(dt0: RealScalarLike) -> BoolScalar:
 
 
 class _Faults(NamedTuple):
-    """The faults of the times of a solve: whether there are any, which one to name, and what to
-    say of each."""
+    """The faults of the times of a solve: whether there are any, which one to report, and the messages."""
 
     any: BoolScalar
     number: IntScalar
@@ -78,15 +77,16 @@ class _Faults(NamedTuple):
 
 
 def _attach(t0: Any, fault: BoolScalar, number: Any, messages: list[str]) -> Any:
-    """An error to a time, which stays a number where it is known that there is none."""
+    """Attach an error to a time; a time that is known to have none stays a number."""
     if not isinstance(fault, jax.core.Tracer) and not bool(fault):
         return t0
     return eqx.branched_error_if(jnp.asarray(t0), fault, number, messages)
 
 
 def refusing_missing_times(function: Function) -> Function:
-    """Wrap a solve: with `throw` an error that names the time at fault, otherwise the result code
-    `RESULTS.nonfinite_input`. Times that are known while tracing are looked at there, and cost nothing."""
+    """Wrap a solve: with `throw` raise an error that names the time at fault, otherwise return the
+    result code `RESULTS.nonfinite_input`. Times that are known while tracing are checked then, at no
+    cost."""
     signature = inspect.signature(function)
 
     @functools.wraps(function)

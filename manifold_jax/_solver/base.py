@@ -1,4 +1,4 @@
-"""What every step hook shares: one `init` and one `step` around those of the wrapped solver."""
+"""The part that all step hooks share: `init` and `step` around those of the wrapped solver."""
 
 import abc
 import dataclasses
@@ -17,9 +17,9 @@ from .._constraint.projection_info import ProjectionInfo
 from .._constraint.settings import NewtonProjection
 from .._rosenbrock import AbstractRosenbrock, MassMatrixTerm
 from .interpolation import CorrectedInterpolationFactory
-from .step.advance import conclude, HookState
 from .step.execution import AbstractExecution, execution_of
 from .step.frame import StepFrame
+from .step.hook_state import conclude, HookState
 
 
 # One-step methods that keep no past values of y. Others (leapfrog, reversible) carry a
@@ -56,21 +56,21 @@ class AbstractManifoldSolver(dfx.AbstractWrappedSolver):
     Source: the common part of sections 3.2 to 3.4 of Sudarsan & Keerthi (1998).
     """
 
-    # Diffrax looks at the type and at some attributes of the solver it is given. It sends type checks
-    # through `.solver`, one level only, so `solver` is the innermost solver; everything else is
+    # Diffrax looks at the type and at some attributes of the solver it is given. It forwards type
+    # checks through `.solver`, one level only, so `solver` is the innermost solver; everything else is
     # forwarded here, in one place.
     inner: eqx.AbstractVar[dfx.AbstractSolver]
     constraint: eqx.AbstractVar[AbstractConstraint]
     projection: eqx.AbstractVar[NewtonProjection]
     corrects_output: eqx.AbstractVar[bool]
-    # Whether interpolants are bent to end at the corrected state. Not where every interpolated value
-    # is corrected afterwards, which makes them continuous by itself: the same correction of the same
-    # point. Bending costs more than interpolating.
+    # Whether interpolants are bent to end at the corrected state. Not needed if every interpolated
+    # value is corrected afterwards: the same correction of the same point makes them continuous.
+    # Bending costs more than interpolating.
     bends_interpolant: bool = eqx.field(default=True, kw_only=True)
-    # Whether the error estimate of a step is at least the size of its correction, which is a lower
+    # Whether the error estimate of a step is raised to the size of its correction, which is a lower
     # bound of the local error (Sudarsan & Keerthi 1998, 3.4).
     bounds_error: bool = eqx.field(default=False, kw_only=True)
-    # A state near that of the coordinates in which steps are made, where those are not the state.
+    # `(y, w) -> y`, a state near that of the coordinates `w` of steps; None if they are states.
     state_of_coordinates: Callable[[Y, Y], Y] | None = eqx.field(
         default=None, kw_only=True, static=True
     )
@@ -84,9 +84,9 @@ class AbstractManifoldSolver(dfx.AbstractWrappedSolver):
     def frame(
         self, terms: Any, t0: RealScalarLike, t1: RealScalarLike, y0: Y, args: Args
     ) -> StepFrame:
-        """The coordinates in which the step from `t0` to `t1` is made, and how its end is corrected.
-        Times are those of Diffrax, which are negated backwards: `diffrax` calls terms with
-        `t * direction`. `mj.StepFrame.of_state(y0, terms, correct)` where the state is its own
+        """Return the coordinates in which the step from `t0` to `t1` is made, and the correction of its
+        end. Times are those of Diffrax, which are negated backwards: `diffrax` calls terms with
+        `t * direction`. Write `mj.StepFrame.of_state(y0, terms, correct)` if the state is its own
         coordinates; `correct(y)` returns the new state and a [`ProjectionInfo`][]."""
 
     def init(self, terms, t0: RealScalarLike, t1: RealScalarLike, y0: Y, args: Args) -> HookState:
@@ -121,7 +121,7 @@ class AbstractManifoldSolver(dfx.AbstractWrappedSolver):
     def execution(
         self, terms: Any, t0: RealScalarLike, t1: RealScalarLike, y0: Y, args: Args
     ) -> AbstractExecution:
-        """How steps of `inner` are executed, for terms that are prepared."""
+        """Choose how steps of `inner` are executed, for terms that are prepared."""
         return execution_of(self.inner, terms, t0, t1, y0, args)
 
     @property
@@ -133,8 +133,8 @@ class AbstractManifoldSolver(dfx.AbstractWrappedSolver):
     def within(
         self, controller: dfx.AbstractStepSizeController, bends_interpolant: bool
     ) -> "AbstractManifoldSolver":
-        """The solver as `mj.diffeqsolve` runs it: with the tolerances of the step size controller,
-        which it cannot see by itself, unless it has others. Errors are bounded if there are any."""
+        """Return the solver as `mj.diffeqsolve` runs it: with the tolerances of the step size
+        controller, unless it has its own. Error estimates are raised to corrections if there are any."""
         tolerances = controller_tolerances(controller)
         projection = self.projection
         if tolerances is not None and projection.rtol is None:
@@ -149,7 +149,7 @@ class AbstractManifoldSolver(dfx.AbstractWrappedSolver):
     def correct(
         self, t: RealScalarLike, y: Y, args: Args, fallback: Y | None = None
     ) -> tuple[Y, ProjectionInfo]:
-        """A state on the manifold, at the true time `t`."""
+        """Correct a state onto the manifold, at the true time `t`."""
         return self.constraint.correct(self.projection, t, y, args, fallback=fallback)
 
     @property
@@ -164,7 +164,7 @@ class AbstractManifoldSolver(dfx.AbstractWrappedSolver):
     def term_compatible_contr_kwargs(self):  # pyright: ignore
         return self.inner.term_compatible_contr_kwargs
 
-    # Read, and replaced through `eqx.tree_at`, when the innermost solver is implicit.
+    # Read, and replaced with `eqx.tree_at`, if the innermost solver is implicit.
     @property
     def root_finder(self):
         return self.solver.root_finder  # pyright: ignore
@@ -192,7 +192,7 @@ class AbstractManifoldSolver(dfx.AbstractWrappedSolver):
 
 
 def controller_tolerances(controller: Any) -> dfx.PIDController | None:
-    """The controller that holds `rtol`, `atol` and `norm`, inside any wrappers around it."""
+    """Return the controller that holds `rtol`, `atol` and `norm`, inside any wrappers around it."""
     while hasattr(controller, "controller"):
         controller = controller.controller
     return controller if isinstance(controller, dfx.PIDController) else None

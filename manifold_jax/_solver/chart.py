@@ -1,17 +1,17 @@
 r"""Local coordinates on the manifold around a point `c` (the paper's parameterization approach).
 
-With directions `V` across the manifold (shape `(n, m)`, `G(c) V` regular) every point near `c` is
+With directions `V` across the manifold (shape `(n, m)`, `G(c) V` nonsingular) every point near `c` is
 
     x = lift(w) = w + V z,     g(t, w + V z) = 0,
 
-and all `w` that differ by a multiple of `V` have the same `x`: the coordinates of `x` are `w`
-modulo the span of `V`. A Runge-Kutta method is linear in the stages, so that it may as well
-compute with any representative `w`: it needs no basis of the coordinate space. The tangent
-space chart is `V = W^-1 G(c)^T`; a partition into dependent and independent coordinates is
-`V = D G(c)^T` with the 0-1 matrix `D` that selects the dependent ones.
+and all `w` that differ by an element of `range(V)` have the same `x`: the coordinates of `x` are `w`
+modulo `range(V)`. A Runge-Kutta method is linear in the stages, so it can compute with any
+representative `w` and needs no basis of the coordinate space. The tangent space chart is
+`V = W^-1 G(c)^T`; a partition into dependent and independent coordinates is `V = D G(c)^T` with the 0-1
+matrix `D` that selects the dependent ones.
 
-Source: Rheinboldt, Math. Comp. 43 (1984) 473-482; Wehage & Haug, J. Mech. Design 104 (1982)
-247-255; Potra & Rheinboldt, Mech. Struct. Mach. 19 (1991) 1-18.
+Source: Rheinboldt, Math. Comp. 43 (1984) 473-482; Wehage & Haug, J. Mech. Design 104 (1982) 247-255;
+Potra & Rheinboldt, Mech. Struct. Mach. 19 (1991) 1-18.
 """
 
 import abc
@@ -33,38 +33,37 @@ from .._linalg.rows import combine
 class AbstractCoordinates(eqx.Module):
     """Coordinates `w` near one point of the manifold, the one at which a step begins.
 
-    `w`, a pytree of arrays of any shapes, is what the solver advances: `w' = pull_back(f(t, y))`
-    at `y = lift(w)`, from `origin` on. Times are true times. All methods are traced, for one
-    trajectory, and must be differentiable. The order of the solver is kept if `lift` and
-    `pull_back` belong together: `d lift(w) / dt = f` for `w' = pull_back(f)`, up to directions
-    which `lift` does not depend on.
+    `w`, a pytree of arrays of any shapes, is what the solver advances: `w' = pull_back(f(t, y))` at
+    `y = lift(w)`, starting from `origin`. Times are true times. All methods are traced, for one
+    trajectory, and must be differentiable. The order of the solver is preserved if `lift` and
+    `pull_back` are consistent: `d lift(w) / dt = f` for `w' = pull_back(f)`, up to directions on which
+    `lift` does not depend.
     """
 
     origin: eqx.AbstractVar[Y]  # the coordinates of the point itself
 
     @abc.abstractmethod
     def lift(self, t: RealScalarLike, w: Y, args: Args) -> tuple[Y, ProjectionInfo]:
-        """The point of the manifold with those coordinates at time `t`. `info.success` is false
+        """Return the point of the manifold with these coordinates at time `t`. `info.success` is false
         where there is none; its derivative must be finite there, too."""
 
     @abc.abstractmethod
     def pull_back(self, t: RealScalarLike, w: Y, y: Y, vector: Y) -> Y:
-        """The velocity of the coordinates, like `w`, that belongs to a velocity `vector` of the
+        """Return the velocity of the coordinates, like `w`, that belongs to a velocity `vector` of the
         state at `y = lift(w)`. Linear in `vector`, which is tangent."""
 
     @abc.abstractmethod
     def push_forward(self, t: RealScalarLike, w: Y, y: Y, args: Args, error: Y) -> Y:
-        """The error of the state `y = lift(w)`, like `y`, that belongs to one of the coordinates:
-        the derivative of the lift. Tolerances are those of the state."""
+        """Return the error of the state `y = lift(w)`, like `y`, that belongs to an error of the
+        coordinates: the derivative of the lift. Tolerances are those of the state."""
 
 
 class AbstractChart(eqx.Module):
-    """Local coordinates for [`LocalCoordinates`][], set up anew at the beginning of each step.
+    """Local coordinates for [`LocalCoordinates`][], constructed at the beginning of each step.
 
-    Implementations provide `at`. If coordinates are not themselves states near the manifold, as
-    representatives are, they provide `state`, too. No arrays but those of the state and of the
-    constraint may be needed for it: dense output keeps coordinates and the states at the beginnings
-    of steps.
+    Implementations provide `at`. If coordinates are not themselves states near the manifold, they also
+    provide `state`. It may only need arrays of the state and of the constraint: dense output stores the
+    coordinates and the states at the beginnings of steps.
     """
 
     @abc.abstractmethod
@@ -76,7 +75,7 @@ class AbstractChart(eqx.Module):
         y: Y,
         args: Args,
     ) -> AbstractCoordinates:
-        """Coordinates around the point `y` of the manifold at the true time `t`."""
+        """Return coordinates around the point `y` of the manifold at the true time `t`."""
 
     def check(self, constraint: AbstractConstraint) -> None:
         """Raise `ValueError` for constraints that have no such coordinates."""
@@ -84,13 +83,13 @@ class AbstractChart(eqx.Module):
 
     @property
     def state(self) -> Callable[[Y, Y], Y] | None:
-        """`state(y, w)`: a state near the one with coordinates `w` around `y`, for dense output,
-        which is then corrected. `None` if that is `w` itself."""
+        """`state(y, w)`: a state near the one with coordinates `w` around `y`, for dense output, which
+        is then corrected. `None` if that is `w` itself."""
         return None
 
 
 def check_state_like(chart: AbstractChart, origin: Y, y: Y) -> None:
-    """Refuse coordinates that cannot be states, of a chart that takes them for such."""
+    """Refuse coordinates that are not like the state, if the chart takes them for states."""
     shapes = lambda tree: [jnp.shape(leaf) for leaf in jtu.tree_leaves(tree)]
     if jtu.tree_structure(origin) == jtu.tree_structure(y) and shapes(origin) == shapes(y):
         return
@@ -102,7 +101,7 @@ def check_state_like(chart: AbstractChart, origin: Y, y: Y) -> None:
 
 
 class _Representatives(AbstractCoordinates):
-    """States modulo the span of the directions."""
+    """States modulo the range of the directions."""
 
     constraint: AbstractConstraint
     projection: NewtonProjection
@@ -146,8 +145,7 @@ class CoordinatePartitionChart(AbstractChart):
     Prefer [`TangentSpaceChart`][]: partitions need more steps and amplify errors where the
     dependence is ill-conditioned.
 
-    Source: Wehage & Haug, J. Mech. Design 104 (1982) 247-255 (generalized coordinate
-    partitioning).
+    Source: Wehage & Haug, J. Mech. Design 104 (1982) 247-255 (generalized coordinate partitioning).
     """
 
     def at(self, constraint, projection, t, y, args) -> AbstractCoordinates:
@@ -170,7 +168,7 @@ def _refuse_redundant(constraint: AbstractConstraint) -> None:
 
 
 def dependent_coordinates(G: Float[Array, "m n"]) -> Float[Array, " n"]:
-    """1 for the `m` columns that a QR decomposition with column pivoting takes first, else 0."""
+    """Return 1 for the `m` columns that a QR decomposition with column pivoting takes first, else 0."""
     G = jax.lax.stop_gradient(G)
     size = jnp.max(jnp.abs(G), axis=1, keepdims=True)
     rest = G / jnp.where(size > 0, size, 1)

@@ -19,10 +19,10 @@ from .._constraint.settings import NewtonProjection
 
 class CorrectedInterpolation(dfx.AbstractLocalInterpolation):
     """A solver's own interpolant, bent so that it ends at the corrected state:
-    `inner(t) + s^2 (3 - 2 s) (y1 - inner(t1))`, `s` running from 0 to 1 over the step.
+    `inner(t) + s^2 (3 - 2 s) (y1 - inner(t1))`, with `s` from 0 to 1 over the step.
 
-    Without this the interpolant would jump at every step by the size of the correction,
-    and the search for the time of an event could find no root.
+    Without this the interpolant would jump at every step by the size of the correction, and the search
+    for the time of an event could find no root.
     """
 
     t0: RealScalarLike
@@ -41,8 +41,8 @@ class CorrectedInterpolation(dfx.AbstractLocalInterpolation):
         s = (t0 - self.t0) / jnp.where(width == 0, 1, width)
         blend = s**2 * (3 - 2 * s)
         bent = jtu.tree_map(lambda v, c: v + (blend * c).astype(v.dtype), value, self.correction)
-        # Exactly the corrected state at the end, not up to rounding; the derivative with
-        # respect to time stays that of the interpolant.
+        # The corrected state exactly at the end, not only up to rounding; the derivative with respect
+        # to time stays that of the interpolant.
         at_end = t0 == self.t1
         rest = jtu.tree_map(lambda y, b: jnp.where(at_end, y - b, 0), self.y1, bent)
         return jtu.tree_map(jnp.add, bent, jax.lax.stop_gradient(rest))
@@ -69,7 +69,7 @@ class CorrectedInterpolationFactory(eqx.Module):
     """Builds [`CorrectedInterpolation`][] from the `dense_info` of a step.
 
     Diffrax keeps `interpolation_cls` in a static field, so this holds no arrays. `state(start, w)`
-    makes a state of what the solver interpolates, if that is something else.
+    converts interpolated coordinates to a state, if they are not states.
     """
 
     inner: Callable[..., dfx.AbstractLocalInterpolation] = eqx.field(static=True)
@@ -90,13 +90,13 @@ class CorrectedInterpolationFactory(eqx.Module):
 
 
 class ManifoldInterpolation(dfx.AbstractPath):
-    """The dense solution of a solve, every value of it on the manifold.
+    """The dense solution of a solve, with every value on the manifold.
 
-    Evaluates the piecewise interpolant of the steps and corrects the value. A value that
-    cannot be corrected is NaN.
+    Evaluates the piecewise interpolant of the steps and corrects the value. A value that cannot be
+    corrected is NaN.
 
-    Only arrays are leaves, as a solution may be returned from `jax.jit`: what the constraint
-    closes over is among them, its functions are not.
+    Only arrays are leaves, as a solution may be returned from `jax.jit`: closed-over arrays of the
+    constraint are among them, its functions are not.
     """
 
     inner: dfx.AbstractPath
@@ -112,7 +112,7 @@ class ManifoldInterpolation(dfx.AbstractPath):
         y: Y,
         args: Args,
     ) -> "ManifoldInterpolation":
-        """`t` and `y` are any time and state."""
+        """Build the solution; `t` and `y` are examples of a time and a state."""
 
         def correct(t: Array, y: Y) -> Y:
             corrected, info = constraint.correct(projection, t, y, args)
@@ -125,7 +125,7 @@ class ManifoldInterpolation(dfx.AbstractPath):
         return ManifoldInterpolation(inner, arrays, (tuple(leaves), tree))
 
     def __deepcopy__(self, memo: dict[int, Any]) -> "ManifoldInterpolation":
-        """Copy with arrays of its own; traced functions do not change."""
+        """Copy with its own arrays; traced functions are shared."""
         inner, arrays = copy.deepcopy((self.inner, self.arrays), memo)
         return ManifoldInterpolation(inner, arrays, self.functions)
 

@@ -24,16 +24,14 @@ class LocalCoordinates(AbstractManifoldSolver):
     """Any one-step solver in local coordinates: every *stage* is on the manifold, not only
     every step (the paper's parameterization approach).
 
-    At the beginning of each step a chart `x = lift(w)` is set up, `w' = f(t, lift(w))` is
-    advanced by one step of the wrapped solver, and the result lifted. The order of the
-    wrapped solver is kept. Its error estimate is pushed forward to the state, so that the
-    tolerances mean the same as for the other approaches. A stage that has no point on the
-    manifold near it rejects the step.
+    At the beginning of each step a chart `x = lift(w)` is set up, `w' = f(t, lift(w))` is advanced by
+    one step of the wrapped solver, and the result lifted. The order of the solver is preserved. Its
+    error estimate is pushed forward to the state, so that the tolerances mean the same as for the other
+    approaches. A stage that has no point on the manifold near it rejects the step.
 
     **Arguments:**
 
-    - `solver`, `constraint`, `projection`: as for [`Projected`][]; the equations must be
-        independent.
+    - `solver`, `constraint`, `projection`: as for [`Projected`][]; the equations must be independent.
     - `chart`: [`TangentSpaceChart`][] (default) or [`CoordinatePartitionChart`][].
 
     **Raises:**
@@ -113,10 +111,10 @@ class _DirectedCoordinates(eqx.Module):
         return self.of.lift(t * self.direction, w, args)
 
     def field(self, term: dfx.AbstractTerm, t: RealScalarLike, w: Y, args: Args) -> Any:
-        """The velocity of the coordinates, NaN where there is no lift."""
+        """Return the velocity of the coordinates, NaN where there is no lift."""
         lifted, info = self.lift(t, w, args)
-        # Evaluated at a point where it is finite, and then added to: the derivative of a NaN
-        # in a step that is rejected would otherwise be NaN, not zero.
+        # Evaluated at a point where it is finite, then made NaN by an addition: the derivative of a NaN
+        # in a rejected step would be NaN instead of zero.
         where = lambda a, b: jnp.where(info.success, a, jax.lax.stop_gradient(b))
         lifted = jtu.tree_map(where, lifted, self.centre)
         velocity = self.pull_back(t, w, lifted, term.vf(t, lifted, args))

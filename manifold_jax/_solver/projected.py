@@ -17,15 +17,14 @@ class Projected(AbstractManifoldSolver):
     """Any one-step solver, followed by a correction of the state onto the manifold:
     `y1 = pi(Phi_h(y0))`, `g(t1, y1, args) = 0` (projection; the paper's perturbation approach).
 
-    The order of the wrapped solver is kept. The step size controller chooses the steps, from the
-    solver's error estimate before the correction; [`mj.diffeqsolve`][] with an adaptive one also counts
-    the correction as an error, where it is the larger of both. A step that cannot be corrected is rejected and repeated with a smaller one;
-    if no smaller one is possible (constant steps, or steps at the limit of the time's
-    precision) the solve ends with `RESULTS.nonlinear_divergence`.
+    The order of the wrapped solver is preserved. The step size controller uses the solver's error estimate
+    before the correction; [`mj.diffeqsolve`][] with an adaptive controller raises it to the size of the
+    correction if that is larger. A step that cannot be corrected is rejected and repeated with a smaller
+    step size; if no smaller one is possible (constant steps, or steps at the limit of the time's precision)
+    the solve ends with `RESULTS.nonlinear_divergence`.
 
-    Works with `diffrax.diffeqsolve`, where every *step* ends on the manifold; use
-    [`mj.diffeqsolve`][] to have the initial value, every saved value, events and the dense
-    solution there too.
+    Works with `diffrax.diffeqsolve`, where every *step* ends on the manifold; use [`mj.diffeqsolve`][]
+    to have the initial value, every saved value, events and the dense solution there too.
 
     **Arguments:**
 
@@ -36,16 +35,15 @@ class Projected(AbstractManifoldSolver):
 
     **Raises:**
 
-    `ValueError` for solvers that carry past values of `y` (leapfrog, reversible) and for
-    Ito solvers of stochastic equations: projection makes them converge to the Stratonovich
-    solution.
+    `ValueError` for solvers that carry past values of `y` (leapfrog, reversible) and for Ito solvers of
+    stochastic equations: projection makes them converge to the Stratonovich solution.
 
     Projection guarantees the constraint, not a smaller error: usually the error shrinks,
     sometimes it grows (compare with `manifold-jax compare`).
 
-    The vector field has to be tangent to the manifold where it is evaluated, up to the tolerance;
-    the corrections are as small as the errors of the solver then. Make others so with
-    [`tangent_field`][] (neural networks, simplified models).
+    The vector field has to be tangent to the manifold where it is evaluated, up to the tolerance; then the
+    corrections are as small as the errors of the solver. Others (neural networks, simplified models) can be
+    made tangent with [`tangent_field`][].
 
     Source: Sudarsan & Keerthi (1998), section 3.4; Shampine, Comp. Math. Appl. 12B (1986)
     1287-1296; Eich, SIAM J. Numer. Anal. 30 (1993) 1467-1482.

@@ -1,7 +1,7 @@
-r"""Vector fields whose solutions are drawn to the manifold (constraint stabilization).
+r"""Vector fields whose solutions are attracted to the manifold (constraint stabilization).
 
-With `V = W^-1 G^T`, so that `G^+ = V (G V)^-1` is a generalized inverse of `G`, and the sign
-`s = +-1` of the direction in which time is integrated.
+With `V = W^-1 G^T`, so that `G^+ = V (G V)^-1` is a generalized inverse of `G`, and the sign `s = +-1`
+of the direction in which time is integrated.
 """
 
 import abc
@@ -32,15 +32,15 @@ def refuse_negative(name: str, gain: RealScalarLike) -> None:
 
 
 def is_stable(gain: RealScalarLike, step: RealScalarLike, solver: dfx.AbstractSolver) -> BoolScalar:
-    """Whether `exp(-gain t)` is approximated by something that decays."""
+    """Whether the approximation of `exp(-gain t)` decays."""
     gain = jnp.asarray(gain)
-    # Rounding of a step at the limit itself does not count.
+    # A step at the limit itself may exceed it by rounding.
     return (gain >= 0) & (gain * jnp.abs(step) <= 1.0001 * stability_interval(solver))
 
 
 def stability_interval(solver: dfx.AbstractSolver) -> float:
-    """The largest `x` with `|R(-s)| <= 1` for all `0 <= s <= x`, `R` the stability function
-    of an explicit Runge-Kutta method; infinite for other solvers."""
+    """Return the largest `x` with `|R(-s)| <= 1` for all `0 <= s <= x`, where `R` is the stability
+    function of an explicit Runge-Kutta method; infinite for other solvers."""
     tableau: Any = getattr(solver, "tableau", None)
     if not isinstance(solver, dfx.AbstractERK) or not isinstance(tableau, dfx.ButcherTableau):
         return 2.0 if isinstance(solver, dfx.Euler) else float("inf")
@@ -62,22 +62,21 @@ Field: TypeAlias = Callable[[RealScalarLike, Y, Args], Y]
 
 
 class AbstractStabilization(eqx.Module):
-    """A modification of a vector field `f`, after which violations decay, for [`Stabilized`][].
+    """A modification of a vector field `f` that makes violations decay, for [`Stabilized`][].
 
-    Implementations provide `field`, and say by `rate` how stiff it is, by `ends_on_manifold`
-    whether the ends of steps are to be corrected.
+    Implementations provide `field`, `rate`, which says how stiff it is, and `ends_on_manifold`, whether
+    the ends of steps are to be corrected.
     """
 
     @property
     @abc.abstractmethod
     def rate(self) -> RealScalarLike:
-        """The largest rate of decay, 1/time. Steps `h` with `rate * h` beyond the stability
-        interval of the solver are rejected; 0 if it is for the error estimate to see."""
+        """The largest rate of decay, 1/time. Steps `h` with `rate * h` beyond the stability interval of
+        the solver are rejected; with 0 that is left to the error estimate."""
 
     @property
     def ends_on_manifold(self) -> bool:
-        """Whether every step is to end on the manifold, with all that is returned. Known while
-        tracing."""
+        """Whether every step ends on the manifold, with all that is returned. Known while tracing."""
         return False
 
     @abc.abstractmethod
@@ -91,9 +90,10 @@ class AbstractStabilization(eqx.Module):
         y: Y,
         args: Args,
     ) -> Y:
-        """The stabilized field at the true time `t` and the state `y` of one trajectory, like `y`.
+        """Return the stabilized field at the true time `t` and the state `y` of one trajectory, like
+        `y`.
 
-        `sign` is the direction of integration: what decays forwards in time must be multiplied
+        `sign` is the direction of integration: a term that decays forwards in time must be multiplied
         by it to decay backwards, too. NaN where the field is not defined: such a step is rejected.
         """
 
@@ -110,10 +110,9 @@ class InvariantStabilization(AbstractStabilization):
         this is the projected vector field, for which `g` keeps its value: neutral, violations
         drift linearly with the errors of the solver.
 
-    One Jacobian per evaluation of the field, no iteration. `gain * h` must stay within the
-    stability interval of the solver on the negative real axis (Euler 2, Tsit5 3.5, Dopri5
-    3.3); a step beyond it is rejected, or fails if steps are constant. Large gains make the
-    problem stiff.
+    One Jacobian per evaluation of the field, no iteration. `gain * h` must stay within the stability
+    interval of the solver on the negative real axis (Euler 2, Tsit5 3.5, Dopri5 3.3); a step beyond it
+    is rejected, or fails if steps are constant. Large gains make the problem stiff.
 
     Source: Ascher, Chin & Reich, Numer. Math. 67 (1994) 131-149 (stabilization of invariants).
     """
@@ -131,7 +130,7 @@ class InvariantStabilization(AbstractStabilization):
     def field(self, f, constraint, projection, sign, t, y, args):
         derivative = f(t, y, args)
         w, unravel = jfu.ravel_pytree(derivative)
-        # Of the whole state, whatever structure the constraint has: components are not moved apart.
+        # For the whole state, whatever the constraint: components are not corrected separately.
         equations = _equations(constraint, t, y, args, projection)
         x, t = equations.x, equations.t
         factored = equations.factored()
@@ -139,7 +138,7 @@ class InvariantStabilization(AbstractStabilization):
         if self.projected:
             residual = lambda t, x: equations.function(t, x, equations.args)
             rate = rate + jax.jvp(residual, (t, x), (jnp.ones_like(t), w))[1]
-        undefined = jnp.where(factored.factorization.full_rank, 0, jnp.nan).astype(w.dtype)
+        undefined = jnp.where(factored.factorization.usable, 0, jnp.nan).astype(w.dtype)
         return unravel(w - combine(factored.solve(rate), factored.normals.directions) + undefined)
 
 
@@ -176,13 +175,13 @@ class ExactStabilization(AbstractStabilization):
         return isinstance(self.gain, int | float) and self.gain == 0
 
     def field(self, f, constraint, projection, sign, t, y, args):
-        # Of the whole state, the nearest point in all components.
+        # For the whole state: the nearest point in all components.
         equations = _equations(constraint, t, y, args, projection)
         x, unravel = equations.x, jfu.ravel_pytree(y)[1]
         root = solve_correction(equations, jax.lax.stop_gradient(x), projection, False)
         if not self.ends_on_manifold:
-            # Again along the normals at that point: the nearest one to one more order, without
-            # which the change of the distance would have a part of the size of its square.
+            # Corrected again along the normals at that point, which gives the nearest point to one
+            # order higher. Otherwise the change of the distance would have an error of its square.
             normals = equations.starting_at(root.p).normals()
             again = equations.along(normals.directions)
             root = solve_correction(again, jax.lax.stop_gradient(x), projection, False)

@@ -1,4 +1,4 @@
-"""Constraint stabilization: a vector field that is drawn to the manifold."""
+"""Constraint stabilization: a vector field that is attracted to the manifold."""
 
 from typing import Any
 
@@ -23,22 +23,20 @@ class Stabilized(AbstractManifoldSolver):
     (constraint stabilization).
 
     Works forward and backward in time: violations decay in the direction of integration.
-    What is returned is not corrected (except with `ExactStabilization(0)`): the violation
-    is of the size of the tolerance. Use [`Projected`][] for values on the manifold.
+    Results are not corrected (except with `ExactStabilization(0)`): the violation is of the
+    size of the tolerance. Use [`Projected`][] for values on the manifold.
 
     **Arguments:**
 
     - `solver`, `constraint`: as for [`Projected`][]; ordinary differential equations only.
-    - `stabilization`: [`InvariantStabilization`][] or [`ExactStabilization`][].
-        [`Baumgarte`][] and [`VelocityStabilization`][] change the
-        accelerations of a [`MechanicalSystem`][] instead.
+    - `stabilization`: [`InvariantStabilization`][] or [`ExactStabilization`][]. [`Baumgarte`][] and
+        [`VelocityStabilization`][] change the accelerations of a [`MechanicalSystem`][] instead.
     - `projection`: metric of the correction, [`NewtonProjection`][].
 
     **Raises:**
 
-    As [`Projected`][]. A step with `gain * h` beyond the stability interval of an explicit
-    solver is rejected, or ends the solve with `RESULTS.nonlinear_divergence` if steps are
-    constant.
+    As [`Projected`][]. A step with `gain * h` beyond the stability interval of an explicit solver is
+    rejected, or ends the solve with `RESULTS.nonlinear_divergence` if steps are constant.
 
     Source: Sudarsan & Keerthi (1998), section 3.3; Ascher, Chin & Reich, Numer. Math. 67
     (1994) 131-149.

@@ -1,4 +1,4 @@
-"""Vector fields that are not tangent to the manifold by themselves, made so."""
+"""Projection of vector fields onto the tangent space of the manifold."""
 
 from collections.abc import Callable
 from typing import Any
@@ -14,7 +14,7 @@ from .stabilization import InvariantStabilization
 
 
 class TangentField(eqx.Module):
-    """What [`tangent_field`][] returns: a function `(t, y, args)`."""
+    """The function `(t, y, args)` that [`tangent_field`][] returns."""
 
     function: Callable
     constraint: AbstractConstraint

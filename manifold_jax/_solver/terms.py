@@ -1,4 +1,4 @@
-"""Terms of the library: a vector field changed by a step hook, and one that knows the direction of time."""
+"""Terms with a changed vector field, and terms that depend on the direction of time."""
 
 from collections.abc import Callable
 from typing import Any
@@ -11,9 +11,8 @@ from .._base.types import Args, RealScalarLike, Y
 
 
 class DirectedTerm(dfx.AbstractTerm):
-    """`dy = (f(t, y) + s d(t, y)) dt` with `s` the sign of the step: damping `d` that damps
-    backwards in time, too. The vector field returns `(f, d)`; `rate` (1/time) is that of the
-    fastest decay."""
+    """`dy = (f(t, y) + s d(t, y)) dt` with `s` the sign of the step: damping `d` that damps backwards
+    in time, too. The vector field returns `(f, d)`; `rate` (1/time) is that of the fastest decay."""
 
     vector_field: Callable
     rate: RealScalarLike

@@ -1,4 +1,4 @@
-"""A solver without a constraint, as a hook: steps are what they are."""
+"""A hook without a constraint: steps are not changed."""
 
 from typing import Any, ClassVar
 
@@ -14,8 +14,8 @@ from .step.frame import StepFrame
 
 
 class Unconstrained(AbstractManifoldSolver):
-    """A method whose steps are what they are: nothing is corrected, nor rejected that the method would
-    keep alone. An explicit Runge-Kutta method, or a Rosenbrock method without a mass matrix."""
+    """A method without a constraint: nothing is corrected, and no step is rejected that the method
+    itself accepts. An explicit Runge-Kutta method, or a Rosenbrock method without a mass matrix."""
 
     inner: dfx.AbstractSolver
     constraint: NoConstraint

@@ -1,1 +1,1 @@
-"""Programs around the library: the command line, comparisons, certificates, films."""
+"""Programs built on the library: the command line, comparisons, certificates, films."""

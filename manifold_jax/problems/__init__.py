@@ -1,9 +1,8 @@
 """The problem gallery: vector fields on manifolds whose solutions are known.
 
-Every function builds a [`Problem`][]; its docstring has the equations, the source of
-every number and the digits to trust. `ALL` has those that take seconds to compile: not the
-delta robot and the Stewart platform, nor those that are there to be large (`polymer`, `cable_net`,
-`falling_truss`, `n_four_bar`).
+Every function builds a [`Problem`][]; its docstring has the equations, the source of every number and
+the digits to trust. `ALL` has those that take seconds to compile: not the delta robot and the Stewart
+platform, nor those that are there to be large (`polymer`, `cable_net`, `falling_truss`, `n_four_bar`).
 """
 
 from collections.abc import Callable

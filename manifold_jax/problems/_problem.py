@@ -1,4 +1,4 @@
-"""What every member of the gallery is: a vector field on a manifold with a known solution."""
+"""The class of all problems of the gallery: a vector field on a manifold with a known solution."""
 
 import dataclasses
 from collections.abc import Callable, Sequence
@@ -24,10 +24,10 @@ def integrate(
     x0: Sequence[float] | np.ndarray,
     t: np.ndarray,
 ) -> np.ndarray:
-    """`x' = field(t, x)` from `x0` at time 0: states of shape `(times, n)` at the times `t`.
+    """Solve `x' = field(t, x)` from `x0` at time 0: states of shape `(times, n)` at the times `t`.
 
-    By SciPy's DOP853, as accurate as it can be: for the pendulum (10 s, 5 swings) the error
-    of angle and rate is below 2e-13.
+    By SciPy's DOP853, as accurate as it can be: for the pendulum (10 s, 5 swings) the error of angle
+    and rate is below 2e-13.
     """
     x0 = np.asarray(x0, np.float64)
     states = np.tile(x0, (t.size, 1))
@@ -63,7 +63,7 @@ class Problem(eqx.Module):
     - `start`: what the initial state is made from: one given by the user, a standard one, or
         `None` for the standard one of `args`.
     - `initial_state`: `(args, start) -> y0`, by default `start` itself.
-    - `invariants`: `(t, y, args)`, what is conserved. Frozen at `y0` they are the constraint.
+    - `invariants`: `(t, y, args)`, conserved quantities. Frozen at `y0` they are the constraint.
     - `exact`: `(t, args, y0) -> y` in NumPy, `t` of shape `(times,)`; the leaves of
         `y` get that leading axis. Raises `ValueError` where it does not hold.
     - `reference_at_end_only`: whether `reference` knows the solution at `t1` alone.
@@ -124,18 +124,17 @@ class Problem(eqx.Module):
         return dataclasses.replace(self, start=y0, y0=y0)
 
     def reference(self, t: Any) -> Any:
-        """The solution from `y0`: exact, or published where no formula is known.
+        """Return the solution from `y0`: exact, or published where no formula is known.
 
         **Arguments:**
 
-        - `t`: one time, or times of shape `(times,)`. Where
-            `reference_at_end_only`, `t1` alone.
+        - `t`: one time, or times of shape `(times,)`. Where `reference_at_end_only`, `t1` alone.
 
         **Returns:**
 
-        The layout of `y0` in NumPy float64, with a leading axis of length `times` if `t`
-        has one. Raises `ValueError` for times, parameters or initial states at which the
-        solution is not known. Formulas hold for a `y0` on the manifold.
+        The layout of `y0` in NumPy float64, with a leading axis of length `times` if `t` has one.
+        Raises `ValueError` for times, parameters or initial states at which the solution is not known.
+        Formulas hold for a `y0` on the manifold.
         """
         t = np.asarray(t, np.float64)
         if t.ndim > 1:
@@ -164,14 +163,14 @@ def require_standard(name: str, standard: Any, actual: Any) -> None:
 
 
 def as_floating(leaf: Any) -> Any:
-    """A floating-point array, so that another value does not mean another compilation."""
+    """Return a floating-point array, so that another value does not mean another compilation."""
     if isinstance(leaf, jax.Array) and jnp.issubdtype(leaf.dtype, jnp.floating):
         return leaf
     return jnp.asarray(leaf, float)
 
 
 def repeated(value: Any, number: int, what: str, each: str = "") -> Array:
-    """A parameter of each of `number` things, given as an array or as one number for all."""
+    """Return a parameter of each of `number` things, given as an array or as one number for all."""
     value = as_floating(value)
     if value.shape not in ((), (number,)):
         raise ValueError(

@@ -24,7 +24,7 @@ class Rods(NamedTuple):
 
     start: np.ndarray
     end: np.ndarray
-    inverse_masses: np.ndarray  # of the points; 0 of fixed ones
+    inverse_masses: np.ndarray  # of the points; 0 for fixed ones
     i: np.ndarray
     j: np.ndarray
     weight: np.ndarray
@@ -44,8 +44,8 @@ class Rods(NamedTuple):
         return points[self.end] - points[self.start]
 
     def along(self, d: np.ndarray, b: np.ndarray) -> np.ndarray:
-        """`M^-1 J^T A^-1 b` at vectors `d` along the rods: the smallest velocities, in the metric of
-        the masses, of which each rod gets `d . d' = b`."""
+        """Return `M^-1 J^T A^-1 b` at vectors `d` along the rods: the smallest velocities, in the
+        metric of the masses, with `d . d' = b` for each rod."""
         bands = np.zeros((int((self.i - self.j).max()) + 1, len(d)))
         products = np.einsum("kd,kd->k", d[self.i], d[self.j])
         bands[self.i - self.j, self.j] = self.weight * products
@@ -62,14 +62,14 @@ def equal_masses(q: Any, args: Any) -> Array:
 
 
 def stretch(d: Any, length2: Any) -> Array:
-    """The residual of rods `d`, `(..., dimensions)`, with the squares of their lengths `length2`.
-    Not as a sum over an axis, which XLA would give to a library."""
+    """Return the residual of rods `d`, `(..., dimensions)`, with the squares of their lengths
+    `length2`. Not as a sum over an axis, for which XLA would call a library."""
     parts = [d[..., i] for i in range(d.shape[-1])]
     return 0.5 * (functools.reduce(operator.add, [x * x for x in parts]) - length2)
 
 
 def allowed(rods: Rods, q: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """The velocities nearest to `v` with rods of constant length."""
+    """Return the velocities nearest to `v` with rods of constant length."""
     d = rods.vectors(q)
     return v - rods.along(d, np.einsum("kd,kd->k", d, rods.vectors(v)))
 
@@ -77,7 +77,7 @@ def allowed(rods: Rods, q: np.ndarray, v: np.ndarray) -> np.ndarray:
 def rod_field(
     rods: Rods, force: Force, dimensions: int
 ) -> Callable[[float, np.ndarray], np.ndarray]:
-    """`x' = field(t, x)` of positions and velocities, one after the other, under forces `force(q)`."""
+    """Return `x' = field(t, x)` for `x` of positions and velocities, under forces `force(q)`."""
     shape = rods.inverse_masses.size, dimensions
 
     def field(_: float, x: np.ndarray) -> np.ndarray:
@@ -93,8 +93,8 @@ def rod_field(
 def solve_rods(
     rods: Rods, force: Force, t: np.ndarray, q: np.ndarray, v: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Positions and velocities at times `t`, from those at time 0, of shape `(points, d)`. Nothing is
-    projected: rods keep their lengths to the accuracy of the integration."""
+    """Return positions and velocities at times `t`, from those at time 0, of shape `(points, d)`.
+    Nothing is projected: rods keep their lengths to the accuracy of the integration."""
     x0 = np.concatenate([q, v]).reshape(-1)
     states = integrate(rod_field(rods, force, q.shape[1]), x0, t).reshape(t.size, 2, *q.shape)
     return states[:, 0], states[:, 1]

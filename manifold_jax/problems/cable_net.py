@@ -20,8 +20,7 @@ _CORNERS = np.array([0, 0, -1, -1]), np.array([0, -1, 0, -1])
 
 class CableNetArgs(NamedTuple):
     """Parameters of `cable_net`: mass of every knot (kg), length of every cable between two of them
-    (m), the distance of neighbouring knots in plan at the start over that length, and gravity
-    (m/s^2)."""
+    (m), the distance of neighbouring knots in plan at the start over that length, and gravity (m/s^2)."""
 
     mass: Any
     length: Any
@@ -40,7 +39,7 @@ def _force(t: RealScalarLike, q: Knots, v: Knots, args: CableNetArgs) -> Knots:
 
 
 def _folded(xp: Any, shape: Any, args: CableNetArgs) -> Any:
-    """Neighbours one up, one down, so that all cables have their length."""
+    """Place neighbours alternately up and down, so that all cables have their length."""
     i, j = np.meshgrid(np.arange(shape[0]), np.arange(shape[1]), indexing="ij")
     i, j, up = (xp.asarray(part, args.length.dtype) for part in (i, j, (i + j) % 2))
     step, rise = args.length * args.spacing, args.length * xp.sqrt(1 - args.spacing**2)
@@ -48,7 +47,7 @@ def _folded(xp: Any, shape: Any, args: CableNetArgs) -> Any:
 
 
 def _initial_state(args: CableNetArgs, start: State) -> State:
-    """Folded and at rest, with as many knots."""
+    """Return the folded net at rest, with as many knots."""
     q = _folded(jnp, start[0].shape, args)
     return q, jnp.zeros_like(q)
 

@@ -43,7 +43,7 @@ def _mass(q: Vector, args: CarAxisArgs) -> FloatScalar:
 
 
 def _wheel(t: RealScalarLike, args: CarAxisArgs) -> tuple[FloatScalar, FloatScalar]:
-    """The right wheel, on the road."""
+    """Return the position of the right wheel, on the road."""
     y = args.road_amplitude * jnp.sin(args.road_frequency * t)
     return jnp.sqrt(args.length**2 - y**2), y
 
@@ -93,9 +93,8 @@ def car_axis(
 ) -> Problem:
     r"""A car axis between two springs on a bumpy road (index 3).
 
-    $q = (x_l, y_l, x_r, y_r)$ are the ends of the axis. The left wheel stays at the
-    origin, the right one rides over the road at $(x_b, y_b)$,
-    $y_b = r \sin \omega t$, $x_b = (L^2 - y_b^2)^{1/2}$:
+    $q = (x_l, y_l, x_r, y_r)$ are the ends of the axis. The left wheel stays at the origin, the right
+    one rides over the road at $(x_b, y_b)$, $y_b = r \sin \omega t$, $x_b = (L^2 - y_b^2)^{1/2}$:
 
     $$k q'' = Q(t, q) - J^T \lambda, \quad k = M \epsilon^2 / 2, \quad
     x_b x_l + y_b y_l = 0, \quad |q_l - q_r|^2 = L^2,$$
@@ -104,10 +103,9 @@ def car_axis(
     `-k g` on both ends of the axis. The state is `(q, v)`, each of shape `(4,)`; four
     constraints, two positions and two velocities, all depending on time.
 
-    From `q = (0, L0, L, L0)` with the velocity `(s, 0, s, 0)`, `s = -r w L0 / L`, that the
-    moving road asks for, to `t = 3`. The state at the end alone is known
-    (`reference_at_end_only`), for the standard parameters and initial state: position to
-    2e-13, velocity to 5e-12.
+    From `q = (0, L0, L, L0)` with the velocity `(s, 0, s, 0)`, `s = -r w L0 / L`, that the moving road
+    asks for, to `t = 3`. The state at the end alone is known (`reference_at_end_only`), for the
+    standard parameters and initial state: position to 2e-13, velocity to 5e-12.
 
     **Arguments:**
 
@@ -118,8 +116,7 @@ def car_axis(
     Known traps: of the 21 printed digits 12 are right, fewer in the velocity; the source
     prints multipliers with the opposite sign (`K q'' = f + J^T lambda`).
 
-    Source: Mazzia & Magherini, Test Set for Initial Value Problem Solvers, problem
-    caraxis.
+    Source: Mazzia & Magherini, Test Set for Initial Value Problem Solvers, problem caraxis.
     """
     args = CarAxisArgs(
         mass, epsilon, length, spring_length, road_amplitude, road_frequency, gravity

@@ -26,8 +26,7 @@ class ChainArgs(NamedTuple):
 
 
 def _links(points: Points) -> Float[Array, "N 2"]:
-    """Return the links from the points `(x1, y1, x2, y2, ...)` to the vectors between them, the
-    support first."""
+    """Return the links from the points `(x1, y1, x2, y2, ...)` to the vectors between them."""
     return jnp.diff(points.reshape(-1, 2), axis=0, prepend=jnp.zeros((1, 2), points.dtype))
 
 
@@ -40,7 +39,7 @@ def _mass(q: Points, args: ChainArgs) -> Points:
 
 
 def _rods(t: RealScalarLike, q: Points, args: ChainArgs) -> Float[Array, " N"]:
-    # As a sum over an axis XLA would give it to a library, which does not fuse with what is around.
+    # For a sum over an axis XLA would call a library, which does not fuse with the rest.
     x, y = _links(q).T
     return 0.5 * (x * x + y * y - args.lengths**2)
 
@@ -51,14 +50,14 @@ def _force(t: RealScalarLike, q: Points, v: Points, args: ChainArgs) -> Points:
 
 
 def _initial_state(args: ChainArgs, start: State) -> State:
-    """The angles of the links and their rates, with the lengths of `args`."""
+    """Return the state for the angles of the links and their rates, with the lengths of `args`."""
     links, rates = _links(start[0]), _links(start[1])
     stretch = (args.lengths / jnp.sqrt(jnp.sum(links * links, axis=1)))[:, None]
     return _points(stretch * links), _points(stretch * rates)
 
 
 def _exact(t: np.ndarray, args: ChainArgs, y0: Any) -> tuple[np.ndarray, np.ndarray]:
-    """The equations of motion of the angles `p_i` of the links from the downward vertical,
+    """Integrate the equations of motion of the angles `p_i` of the links from the downward vertical,
     with the mass `M_i` that link `i` carries, `M_ij = M_max(i,j)`, and the lengths `L_i`:
 
     sum_j M_ij L_i L_j (cos(p_i - p_j) p_j'' + sin(p_i - p_j) p_j'^2) = -g M_i L_i sin p_i.
@@ -102,10 +101,9 @@ def double_pendulum(
     The state is `(q, v)`, `q = (x1, y1, x2, y2)`; four constraints, two positions and two
     velocities. Energy is conserved but not enforced.
 
-    The solution is an independent integration (SciPy's DOP853) of the equations of motion
-    of the two angles, from every initial state on the manifold. Standard problem: to about
-    1e-12. The motion is chaotic when the pendulum goes over the top: no digits are left
-    after long times then.
+    The solution is an independent integration (SciPy's DOP853) of the equations of motion of the two
+    angles, from every initial state on the manifold. Standard problem: to about 1e-12. The motion is
+    chaotic when the pendulum goes over the top: no digits are left after long times then.
 
     **Arguments:**
 
@@ -137,10 +135,9 @@ def chain(
     $$m_i r_i'' = (0, -m_i g) - \lambda_i d_i + \lambda_{i+1} d_{i+1}, \quad
     \tfrac12 (|d_i|^2 - L_i^2) = 0, \quad \lambda_{N+1} = 0.$$
 
-    The state is `(q, v)`, `q = (x1, y1, ..., xN, yN)`; 2N constraints, N positions and N
-    velocities. The matrix $J M^{-1} J^T$ is tridiagonal. For small angles and equal links
-    the frequencies are $(g x_k / L)^{1/2}$ with the zeros $x_k$ of the Laguerre polynomial
-    of degree N.
+    The state is `(q, v)`, `q = (x1, y1, ..., xN, yN)`; 2N constraints, N positions and N velocities.
+    The matrix $J M^{-1} J^T$ is tridiagonal. For small angles and equal links the frequencies are
+    $(g x_k / L)^{1/2}$ with the zeros $x_k$ of the Laguerre polynomial of degree N.
 
     The solution is an independent integration (SciPy's DOP853) of the equations of motion
     of the N angles, from every initial state on the manifold. Standard problem: to about

@@ -15,7 +15,7 @@ from ._problem import as_floating, integrate, Problem
 State: TypeAlias = tuple[Pose, Pose]
 
 ARMS = ("arm 1", "arm 2", "arm 3")
-# Of the arms, seen from above.
+# Directions of the arms, seen from above.
 DIRECTIONS = tuple(2 * math.pi * i / 3 for i in range(3))
 # Half the distance of the two rods of an arm over the radius of the platform.
 SPREAD = 0.5
@@ -37,7 +37,7 @@ class DeltaRobotArgs(NamedTuple):
 
 
 def assembly(args: DeltaRobotArgs) -> Assembly:
-    """The robot as drawn: arms horizontal, of which the platform hangs on its rods."""
+    """Return the robot as drawn: arms horizontal, with the platform hanging on its rods."""
     L, r = args.arm_length, args.platform_radius
     depth = jnp.sqrt(args.rod_length**2 - (args.base_radius + L - r) ** 2)
     zero = jnp.zeros_like(L)
@@ -65,21 +65,21 @@ def assembly(args: DeltaRobotArgs) -> Assembly:
 
 
 def _initial_state(args: DeltaRobotArgs, start: State) -> State:
-    """Position and velocity of the platform of `start`, with the lengths of `args`."""
+    """Return the state for the platform's motion in `start`, with the lengths of `args`."""
     q, v = start
     angle, rate, _ = _arms(jnp, q.position[3], v.position[3], args)
     return _bodies(jnp, q.position[3], v.position[3], angle, rate, args)
 
 
 def _directions(xp: ModuleType, dtype: Any, fraction: float = 1.0) -> tuple[Any, Any]:
-    """Cosines and sines of the directions of the arms, or of a fraction of these angles."""
+    """Return cosines and sines of the directions of the arms, or of a fraction of these angles."""
     angles = fraction * np.array(DIRECTIONS)
     return xp.asarray(np.cos(angles), dtype), xp.asarray(np.sin(angles), dtype)
 
 
 def _arms(xp: ModuleType, x: Any, u: Any, args: Any) -> tuple[Any, Any, tuple]:
-    """Angles of the arms below the horizontal, their rates, and rods `n` with the directions of the
-    arms and their derivatives; in NumPy or JAX, for positions of the platform `(..., 3)`."""
+    """Return angles of the arms below the horizontal, their rates, and rods `n` with the directions of
+    the arms and their derivatives; in NumPy or JAX, for positions of the platform `(..., 3)`."""
     L = args.arm_length
     cosines, sines = _directions(xp, L.dtype)
     flat = lambda a: a[..., 0:1] * cosines + a[..., 1:2] * sines  # radial parts
@@ -98,7 +98,7 @@ def _arms(xp: ModuleType, x: Any, u: Any, args: Any) -> tuple[Any, Any, tuple]:
 
 
 def _bodies(xp: ModuleType, x: Any, u: Any, angle: Any, rate: Any, args: Any) -> State:
-    """Poses and rates of arms and platform; the leading axes are those of `x`."""
+    """Return poses and rates of arms and platform; the leading axes are those of `x`."""
     cosines, sines = _directions(xp, args.arm_length.dtype)
     s, c, half = xp.sin(angle), xp.cos(angle), args.arm_length / 2
     out, fast = args.base_radius + half * c, -half * s * rate
@@ -119,7 +119,7 @@ def _bodies(xp: ModuleType, x: Any, u: Any, angle: Any, rate: Any, args: Any) ->
 
 
 def _exact(t: np.ndarray, args: DeltaRobotArgs, y0: Any) -> State:
-    """The equation of motion of the platform's position, the angles being functions of it:
+    """Integrate the equation of motion of the platform's position, the angles being functions of it:
 
     (m + J sum_i g_i g_i^T) x'' = m g + sum_i g_i (torque_i - J bias_i), g_i = d angle_i / dx.
     """

@@ -27,7 +27,7 @@ class TrussArgs(NamedTuple):
 
 
 def _bars(t: RealScalarLike, q: Joints, args: TrussArgs) -> Float[Array, " bars"]:
-    """Posts, lower and upper chord, and diagonals, by panels."""
+    """Return posts, lower and upper chord, and diagonals, by panels."""
     lower, upper = q[:, 0], q[:, 1]
     post = stretch(upper - lower, args.height**2)
     chords = (stretch(jnp.diff(chord, axis=0), args.length**2) for chord in (lower, upper))
@@ -41,12 +41,12 @@ def _force(t: RealScalarLike, q: Joints, v: Joints, args: TrussArgs) -> Joints:
 
 
 def _initial_state(args: TrussArgs, start: State) -> State:
-    """The place, the angle and the motion of `start`, with the lengths of `args`."""
+    """Return the state for the place, the angle and the motion in `start`, with the lengths of `args`."""
     return _moved(jnp, *_motion(jnp, start), args, start[0].shape[0])
 
 
 def _motion(xp: Any, y: Any) -> tuple[Any, Any, Any, Any]:
-    """Centre, velocity, angle and rate, of a truss that is in shape."""
+    """Return centre, velocity, angle and rate of a truss that is in shape."""
     (q, v), along = y, y[0][-1, 0] - y[0][0, 0]
     turned = v[-1, 0] - v[0, 0]
     rate = (along[0] * turned[1] - along[1] * turned[0]) / (along[0] ** 2 + along[1] ** 2)

@@ -33,7 +33,7 @@ def _mass(q: Vector, args: FourBarArgs) -> Vector:
 
 
 def _joints(t: RealScalarLike, q: Vector, args: FourBarArgs) -> Float[Array, "4 2"]:
-    """Pivot of the crank, crank to coupler, coupler to rocker, pivot of the rocker."""
+    """Return the gaps at the pivot of the crank, the ends of the coupler, and the pivot of the rocker."""
     x, y, angle = q[0::3], q[1::3], q[2::3]
     centers = jnp.stack([x, y], axis=1)
     halves = jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=1) * (0.5 * args.lengths[:3, None])
@@ -48,7 +48,8 @@ def _force(t: RealScalarLike, q: Vector, v: Vector, args: FourBarArgs) -> Vector
 
 
 def _initial_state(args: FourBarArgs, start: State) -> State:
-    """Crank angle and rate of `start` and its way to close the loop, with the lengths of `args`."""
+    """Return the state for crank angle and rate in `start` and its way to close the loop, with the
+    lengths of `args`."""
     angle, rate = start[0][2::3], start[1][2]
     a, b, c, d = args.lengths[0], args.lengths[1], args.lengths[2], args.lengths[3]
     # from the end of the crank to the pivot of the rocker, and the triangle on that side
@@ -65,7 +66,7 @@ def _initial_state(args: FourBarArgs, start: State) -> State:
 
 
 def _ratios(xp: ModuleType, angles: Any, lengths: Any) -> tuple[Any, Any, Any]:
-    """Rates of the angles over that of the crank, in NumPy or JAX."""
+    """Return the rates of the angles over that of the crank, in NumPy or JAX."""
     crank, coupler, rocker = angles[..., 0], angles[..., 1], angles[..., 2]
     sine = xp.sin(coupler - rocker)
     of_coupler = lengths[0] * xp.sin(rocker - crank) / (lengths[1] * sine)
@@ -74,7 +75,7 @@ def _ratios(xp: ModuleType, angles: Any, lengths: Any) -> tuple[Any, Any, Any]:
 
 
 def _bodies(xp: ModuleType, angles: Any, rates: Any, lengths: Any) -> tuple[Any, Any]:
-    """Positions and velocities of the bodies, the last axis of both of length 9."""
+    """Return positions and velocities of the bodies, the last axis of both of length 9."""
     s, c = xp.sin(angles), xp.cos(angles)
     unit = xp.stack([c, s, -s * rates, c * rates])
     crank, coupler, rocker = (unit[..., i] * lengths[i] / 2 for i in range(3))
@@ -86,8 +87,8 @@ def _bodies(xp: ModuleType, angles: Any, rates: Any, lengths: Any) -> tuple[Any,
 
 
 def _exact(t: np.ndarray, args: FourBarArgs, y0: Any) -> tuple[np.ndarray, np.ndarray]:
-    """The equation of motion of the crank's angle, `A(p) p'' + A'(p) p'^2 / 2 + V'(p) = 0`; the
-    other two angles are integrated with it, so that they may turn, and closed by Newton."""
+    """Integrate the equation of motion of the crank's angle, `A(p) p'' + A'(p) p'^2 / 2 + V'(p) = 0`;
+    the other two angles are integrated with it, so that they may turn, and closed by Newton."""
     lengths = args.lengths
     angles, rate = y0[0][2::3], y0[1][2]
     field = _crank_equation(args)
@@ -106,8 +107,7 @@ def _exact(t: np.ndarray, args: FourBarArgs, y0: Any) -> tuple[np.ndarray, np.nd
 
 
 def _crank_equation(args: FourBarArgs) -> Callable[[float, np.ndarray], tuple[float, ...]]:
-    """Return the equation of the three angles and the rate of the crank; lists of floats, which
-    are fast."""
+    """Return the equation of the three angles and the rate of the crank, on lists of floats (fast)."""
     a, b, c, _ = args.lengths.tolist()
     m1, m2, m3 = args.masses.tolist()
     g = float(args.gravity)
@@ -163,10 +163,9 @@ def four_bar(
 
     **Arguments:**
 
-    - `masses` (kg) of crank, coupler and rocker, shape `(3,)`, `lengths` (m) of crank, coupler,
-        rocker and ground, shape `(4,)`, `gravity` (m/s^2): `args`. `with_args` keeps the
-        crank's angle and rate and the way the loop is closed, also those of an initial state
-        of yours.
+    - `masses` (kg) of crank, coupler and rocker, shape `(3,)`, `lengths` (m) of crank, coupler, rocker
+        and ground, shape `(4,)`, `gravity` (m/s^2): `args`. `with_args` keeps the crank's angle and
+        rate and the way the loop is closed, also those of an initial state of yours.
     - `crank_angle`, `crank_rate`: at `t = 0` (radian, radian/s), with the coupler and the
         rocker above the line from the crank's end to the rocker's pivot.
     - `t1`: the end of the time span (s).

@@ -42,9 +42,8 @@ BENCHMARK_QUATERNION = (
 
 
 class HeavyTopArgs(NamedTuple):
-    """Parameters of `heavy_top`: mass (kg), principal moments of inertia about the fixed point
-    (kg m^2), shape `(3,)`, centre of mass in the frame of the body (m), shape `(3,)`, and
-    gravity (m/s^2)."""
+    """Parameters of `heavy_top`: mass (kg), principal moments of inertia about the fixed point (kg
+    m^2), shape `(3,)`, centre of mass in the frame of the body (m), shape `(3,)`, and gravity (m/s^2)."""
 
     mass: Any
     inertia: Any
@@ -62,21 +61,20 @@ def _norm(t: RealScalarLike, q: Vector, args: HeavyTopArgs) -> FloatScalar:
 
 
 def _weight(q: Vector, args: HeavyTopArgs) -> FloatScalar:
-    """The potential energy."""
+    """Return the potential energy."""
     a, b, c, d = q[0], q[1], q[2], q[3]
     vertical = [2 * (b * d - a * c), 2 * (c * d + a * b), a**2 - b**2 - c**2 + d**2]
     return args.mass * args.gravity * jnp.sum(jnp.stack(vertical) * args.center)
 
 
 def _force(t: RealScalarLike, q: Vector, v: Vector, args: HeavyTopArgs) -> Vector:
-    """Return the force of the Lagrangian `(2 G(q) v).I (2 G(q) v) / 2 - V(q)`, with `G(q) v =
-    -G(v) q`."""
+    """Return the force of the Lagrangian `(2 G(q) v).I (2 G(q) v) / 2 - V(q)`, with `G(q) v = -G(v) q`."""
     gyroscopic = -8 * rates_matrix(v).T @ (args.inertia * (rates_matrix(q) @ v))
     return gyroscopic - jax.grad(_weight)(q, args)
 
 
 def _exact(t: np.ndarray, args: HeavyTopArgs, y0: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Euler's equations and the kinematics of the quaternion, `p = (a, b, c, d)`,
+    """Integrate Euler's equations and the kinematics of the quaternion, `p = (a, b, c, d)`,
     `I w' = (I w) x w + c x weight`, `2 p' = p w`."""
     I1, I2, I3 = args.inertia.tolist()
     load = (float(args.mass * args.gravity) * args.center).tolist()
@@ -101,7 +99,7 @@ def _exact(t: np.ndarray, args: HeavyTopArgs, y0: Any) -> tuple[np.ndarray, np.n
 
 
 def _quaternion_rates(x: Sequence[Any]) -> tuple[Any, Any, Any, Any]:
-    """The product of quaternions `p w / 2` of `x = (p, w)`, numbers or arrays."""
+    """Return the product of quaternions `p w / 2` of `x = (p, w)`, numbers or arrays."""
     a, b, c, d, w1, w2, w3 = x
     return (
         0.5 * (-b * w1 - c * w2 - d * w3),
@@ -137,10 +135,9 @@ def heavy_top(
     The standard problem is a symmetric (Lagrange) top, released with its axis 0.6 radian from
     the vertical: it nutates between two heights, with cusps, while it precesses.
 
-    The solution is an independent integration (SciPy's DOP853) of Euler's equations with
-    the kinematics of the quaternion, for all moments of inertia and from every initial state on
-    the manifold; to about 1e-12 in the standard problem. Its height agrees with the elliptic
-    function that it is.
+    The solution is an independent integration (SciPy's DOP853) of Euler's equations with the kinematics
+    of the quaternion, for all moments of inertia and from every initial state on the manifold; to about
+    1e-12 in the standard problem. Its height agrees with the elliptic function that it is.
 
     The benchmark of the literature is `heavy_top(**BENCHMARK)`, a top that spins at 150 rad/s,
     with 5 published digits at the end

@@ -46,7 +46,7 @@ def _initial_state(args: KeplerArgs, start: State | None) -> State:
 
 
 def _exact(t: np.ndarray, args: KeplerArgs, y0: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Kepler's equation, then the functions of Lagrange: `q = f q0 + g v0`."""
+    """Solve Kepler's equation; then the functions of Lagrange give `q = f q0 + g v0`."""
     mu = float(args.mu)
     q0, v0 = y0
     r0 = np.hypot(*q0)
@@ -83,11 +83,10 @@ def kepler(*, mu: Any = 1.0, eccentricity: Any = 0.6, t1: float = 6 * math.pi) -
     $$q'' = -\mu q / |q|^3, \quad \tfrac12 |v|^2 - \mu / |q| = \text{const}, \quad
     q_1 v_2 - q_2 v_1 = \text{const}.$$
 
-    The state is `(q, v)`, each of shape `(2,)`; two constraints. It starts at the
-    pericentre of an orbit of semi-major axis 1,
-    `q = (1 - e, 0)`, `v = (0, sqrt(mu (1 + e) / (1 - e)))`, with period
-    `2 pi / sqrt(mu)`. Exact solution by Kepler's equation from every initial state on a
-    bound orbit, to about `1e-14` for the standard one.
+    The state is `(q, v)`, each of shape `(2,)`; two constraints. It starts at the pericentre of an
+    orbit of semi-major axis 1, `q = (1 - e, 0)`, `v = (0, sqrt(mu (1 + e) / (1 - e)))`, with period
+    `2 pi / sqrt(mu)`. Exact solution by Kepler's equation from every initial state on a bound orbit, to
+    about `1e-14` for the standard one.
 
     The Laplace vector is conserved too but not enforced: together with energy and
     angular momentum it would be four equations of which only three are independent.

@@ -25,8 +25,7 @@ class LotkaVolterraArgs(NamedTuple):
 PUBLISHED_END = (1.026344767571517, 9.096910781383605e-1)
 # The same to 16 digits: Taylor series of order 30, step 0.1, in 40-digit arithmetic.
 END = (1.02634476757508932, 0.909691078136041618)
-# Derivatives of `|1 - y(10)|^2 / 2` with respect to the initial state and the rates, in the
-# same way.
+# Derivatives of `|1 - y(10)|^2 / 2` with respect to the initial state and the rates, in the same way.
 COST_BY_START = (0.299599508303682302, -0.0141518163448535055)
 COST_BY_RATES = (
     0.621961585551280884, 0.0680014041508743366, 0.169176463995892817, 0.272560693950007505,
@@ -67,10 +66,9 @@ def lotka_volterra(
     $$x' = p_0 x - p_1 x y, \quad y' = p_3 x y - p_2 y, \quad
     V = p_3 x - p_2 \log x + p_1 y - p_0 \log y = \text{const}.$$
 
-    The state is `(x, y)` as one array of shape `(2,)`, positive; one constraint; from
-    `(1, 1)` at `t = 0` to `t = 10`. The state at the end alone is known
-    (`reference_at_end_only`), for the standard parameters and initial state: 11 digits are
-    published, `reference` gives 16.
+    The state is `(x, y)` as one array of shape `(2,)`, positive; one constraint; from `(1, 1)` at
+    `t = 0` to `t = 10`. The state at the end alone is known (`reference_at_end_only`), for the standard
+    parameters and initial state: 11 digits are published, `reference` gives 16.
 
     **Arguments:**
 

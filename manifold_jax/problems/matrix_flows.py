@@ -1,7 +1,6 @@
 """Flows on classical matrix manifolds with closed-form solutions.
 
-All data come from fixed formulas, no random numbers: every implementation can use the
-same ones.
+All data come from fixed formulas, no random numbers: every implementation can use the same ones.
 """
 
 from typing import Any, NamedTuple, TypeAlias

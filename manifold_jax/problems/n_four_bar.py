@@ -30,8 +30,8 @@ def _mass(q: Bodies, args: NFourBarArgs) -> Bodies:
 
 
 def _joints(t: RealScalarLike, q: Bodies, args: NFourBarArgs) -> Any:
-    """Return the gaps of the joints of the crank with the ground, with the coupler before it and
-    with that after it."""
+    """Return the gaps of the joints of the crank with the ground, with the coupler before it and with
+    the one after it."""
     half = 0.5 * args.length * jnp.stack([jnp.cos(q[:, 2]), jnp.sin(q[:, 2])], axis=1)
     start, end = q[:, :2] - half, q[:, :2] + half
     pivots = jnp.arange(start[::2].shape[0], dtype=q.dtype) * args.length
@@ -45,13 +45,13 @@ def _force(t: RealScalarLike, q: Bodies, v: Bodies, args: NFourBarArgs) -> Bodie
 
 
 def _initial_state(args: NFourBarArgs, start: State) -> State:
-    """The angle of the first crank and its rate, with the length of `args`."""
+    """Return the state for the angle of the first crank and its rate, with the length of `args`."""
     angle, rate = start[0][0, 2], start[1][0, 2]
     return _bodies(jnp, angle, rate, args.length, start[0].shape[0] // 2)
 
 
 def _bodies(xp: Any, angle: Any, rate: Any, length: Any, loops: int) -> tuple[Any, Any]:
-    """Cranks and couplers in turn, all cranks at the same angle: the last two axes."""
+    """Return cranks and couplers in turn, all cranks at the same angle: the last two axes."""
     c, s, zero = xp.cos(angle), xp.sin(angle), 0 * angle
     rows = lambda *parts: xp.stack([xp.stack(part, axis=-1) for part in parts], axis=-2)
     one = rows((0.5 * length * c, 0.5 * length * s, angle), (length * (c + 0.5), length * s, zero))

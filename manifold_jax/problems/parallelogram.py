@@ -36,7 +36,7 @@ def _mass(q: Vector, args: ParallelogramArgs) -> Vector:
 
 
 def _joints(t: RealScalarLike, q: Vector, args: ParallelogramArgs) -> Float[Array, "2 3"]:
-    """The pins of the coupler less the ends of the cranks."""
+    """Return the pins of the coupler minus the ends of the cranks."""
     pins = args.spacing * jnp.asarray([-1.0, 0.0, 1.0], q.dtype)
     x = q[0] + pins * jnp.cos(q[2]) - pins - args.length * jnp.sin(q[3:])
     y = q[1] + pins * jnp.sin(q[2]) + args.length * jnp.cos(q[3:])
@@ -51,13 +51,13 @@ def _force(t: RealScalarLike, q: Vector, v: Vector, args: ParallelogramArgs) -> 
 
 
 def _initial_state(args: ParallelogramArgs, start: State) -> State:
-    """The angles and rates of the cranks, with the length of `args`."""
+    """Return the state for the angles and rates of the cranks, with the length of `args`."""
     (_, _, tilt, *cranks), (_, _, _, rate, *_) = start
     return _links(jnp, tilt, cranks, rate, args.length)
 
 
 def _links(xp: ModuleType, tilt: Any, cranks: list, rate: Any, length: Any) -> tuple[Any, Any]:
-    """The state of cranks that turn at one rate, in NumPy or JAX."""
+    """Return the state of cranks that turn at one rate, in NumPy or JAX."""
     x, y, still = length * xp.sin(cranks[0]), -length * xp.cos(cranks[0]), 0 * rate
     q, v = [x, y, tilt + still, *cranks], [-y * rate, x * rate, still, rate, rate, rate]
     return xp.stack(q, axis=-1), xp.stack(v, axis=-1)
@@ -105,8 +105,7 @@ def parallelogram(
     five are independent (`redundant=True`): without the third crank the motion would be
     the same, and how the load is shared between the cranks is not determined.
 
-    The state is `(q, v)`, each of shape `(6,)`; twelve constraints, of which ten are
-    independent.
+    The state is `(q, v)`, each of shape `(6,)`; twelve constraints, of which ten are independent.
 
     Exact solution by Jacobi elliptic functions: the coupler does not tilt, and the cranks
     swing like one pendulum of length $L (M + m) / (M + 3 m / 2)$. It holds for swings that

@@ -14,7 +14,7 @@ from .._mechanics import MechanicalSystem
 from ._problem import as_floating, integrate, Problem
 
 
-Vector: TypeAlias = Float[Array, " n"]  # two numbers, three of the spherical pendulum
+Vector: TypeAlias = Float[Array, " n"]  # two numbers, three for the spherical pendulum
 State: TypeAlias = tuple[Vector, Vector]
 
 # Coordinates of benchmark A01 at t = 0, 0.5, ..., 10: released at rest from (-1, 0) with
@@ -62,7 +62,7 @@ def _field(t: RealScalarLike, y: State, args: PendulumArgs) -> State:
 
 
 def _initial_state(args: PendulumArgs, start: State) -> State:
-    """The position of `start` at the length of `args`, and its velocity."""
+    """Return the position in `start` at the length of `args`, and its velocity."""
     q, v = start
     return q * (args.length / jnp.sqrt(jnp.sum(q * q))), v
 
@@ -82,8 +82,8 @@ def _exact(t: np.ndarray, args: PendulumArgs, y0: Any) -> tuple[np.ndarray, np.n
 def swing(
     t: np.ndarray, frequency: float, theta: float, rate: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """`theta'' = -frequency^2 sin(theta)` by Jacobi elliptic functions, `theta` and `rate` at
-    time 0: `sin(theta / 2)`, `cos(theta / 2)` and `theta'` at `t`."""
+    """Solve `theta'' = -frequency^2 sin(theta)` by Jacobi elliptic functions, with `theta` and `rate`
+    at time 0: `sin(theta / 2)`, `cos(theta / 2)` and `theta'` at `t`."""
     # k^2 = (energy above the lowest point) / (2 m g L), at least 1 if it goes over the top
     k2 = (rate / (2 * frequency)) ** 2 + np.sin(theta / 2) ** 2
     k = np.sqrt(k2)
@@ -136,9 +136,8 @@ def pendulum(
     - IFToMM benchmark A01: `pendulum(q0=(-1.0, 0.0))`; its curve, 6 digits, is in this
         module (`from manifold_jax.problems.pendulum import A01_X, A01_Y`). The text of the
         benchmark starts at `x = +1` in one place, its data at `x = -1`: mirror images.
-    - IVP test set: `pendulum(gravity=1.0, v0=(0.0, 1.0), t1=1.0)`. Of the 18 printed
-        digits of the end values only 11 are right (`reference` does not use them). Its
-        multiplier is twice $\lambda$.
+    - IVP test set: `pendulum(gravity=1.0, v0=(0.0, 1.0), t1=1.0)`. Of the 18 printed digits of the end
+        values only 11 are right (`reference` does not use them). Its multiplier is twice $\lambda$.
 
     A known trap: the gravity with which a pendulum released from the horizontal returns
     after 2 s is `4 K(1/2)^2 = 13.750371636040745`; the value 13.7503716373294544 that is
@@ -185,7 +184,7 @@ def _spherical_force(t: RealScalarLike, q: Vector, v: Vector, args: PendulumArgs
 
 
 def _spherical_exact(t: np.ndarray, args: PendulumArgs, y0: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Angles on the sphere are singular at its poles; Newton's equations are not:
+    """Integrate Newton's equations (angles on the sphere are singular at its poles):
 
     q'' = (0, 0, -g) - (|v|^2 - g z) q / |q|^2.
     """
@@ -219,9 +218,8 @@ def spherical_pendulum(
 
     **Arguments:**
 
-    - `gravity` (m/s^2), `length` (m), `mass` (kg): scalars, `args`. `with_args` moves the
-        initial position, also one of yours, along its ray to the new length and keeps the
-        velocity.
+    - `gravity` (m/s^2), `length` (m), `mass` (kg): scalars, `args`. `with_args` moves the initial
+        position, also one of yours, along its ray to the new length and keeps the velocity.
     - `t1`: the end of the time span (s).
 
     Source: Whittaker, A Treatise on the Analytical Dynamics of Particles and Rigid Bodies

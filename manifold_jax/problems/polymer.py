@@ -30,7 +30,7 @@ def _mass(q: Beads, args: PolymerArgs) -> Beads:
 
 
 def _bonds(t: RealScalarLike, q: Beads, args: PolymerArgs) -> Float[Array, " bonds"]:
-    # Not as a sum over an axis, which XLA would give to a library.
+    # Not as a sum over an axis, for which XLA would call a library.
     x, y, z = jnp.diff(q, axis=0).T
     return 0.5 * (x * x + y * y + z * z - args.lengths**2)
 
@@ -40,7 +40,7 @@ def _force(t: RealScalarLike, q: Beads, v: Beads, args: PolymerArgs) -> Beads:
 
 
 def _bending(xp: Any, q: Any, args: PolymerArgs) -> Any:
-    """Minus the gradient of `energy`, with bonds of constant length."""
+    """Return minus the gradient of `energy`, with bonds of constant length."""
     along = xp.diff(q, axis=0) / args.lengths[:, None]
     end = xp.zeros_like(along[:1])
     neighbours = xp.concatenate([end, along[:-1]]) + xp.concatenate([along[1:], end])
@@ -49,7 +49,7 @@ def _bending(xp: Any, q: Any, args: PolymerArgs) -> Any:
 
 
 def energy(y: Any, args: PolymerArgs) -> Any:
-    """Kinetic and bending energy of a state of `polymer`, in NumPy."""
+    """Return kinetic and bending energy of a state of `polymer`, in NumPy."""
     q, v = y
     along = np.diff(q, axis=0) / np.asarray(args.lengths)[:, None]
     bending = args.stiffness * np.sum(1 - np.sum(along[1:] * along[:-1], axis=1))
@@ -57,7 +57,7 @@ def energy(y: Any, args: PolymerArgs) -> Any:
 
 
 def _initial_state(args: PolymerArgs, start: State) -> State:
-    """The directions of the bonds and how they turn, with the lengths of `args`."""
+    """Return the state for directions of bonds and their rates in `start`, with the lengths of `args`."""
     d, rate = jnp.diff(start[0], axis=0), jnp.diff(start[1], axis=0)
     stretch = (args.lengths / jnp.sqrt(jnp.sum(d * d, axis=1)))[:, None]
     ends = lambda first, links: jnp.cumsum(jnp.concatenate([first[:1], stretch * links]), axis=0)

@@ -42,7 +42,7 @@ def _force(t: RealScalarLike, q: Vector, v: Vector, args: RollingDiscArgs) -> Ve
 
 
 def _initial_state(args: RollingDiscArgs, start: State) -> State:
-    """The position and the two angular velocities of `start`, rolling without slipping."""
+    """Return the state for position and angular velocities in `start`, rolling without slipping."""
     q, v = start
     speed = args.radius * v[3]
     return q, jnp.stack([speed * jnp.cos(q[2]), speed * jnp.sin(q[2]), v[2], v[3]])
@@ -103,9 +103,8 @@ def rolling_disc(
     the constraint forces $-\lambda$ at the point of contact. From the origin with the
     heading 0.4, turning at 1.5 /s and rolling at 2 /s, to `t = 10`.
 
-    Exact elementary solution from every initial state on the manifold, to rounding: the
-    heading turns at a constant rate $\omega$, the speed is
-    $u_0 + k (\sin\theta - \sin\theta_0) / \omega$,
+    Exact elementary solution from every initial state on the manifold, to rounding: the heading turns
+    at a constant rate $\omega$, the speed is $u_0 + k (\sin\theta - \sin\theta_0) / \omega$,
     $k = m g \sin\alpha / (m + J / R^2)$, and the disc drifts sideways, not downhill.
 
     **Arguments:**

@@ -65,8 +65,7 @@ def _force(t: RealScalarLike, q: Vector, v: Vector, args: SliderCrankArgs) -> Ve
 
 
 def _initial_state(args: SliderCrankArgs, start: State | None) -> State:
-    """Return the state at rest with the crank upright, or assembled from the crank's angle and
-    rate of `start`."""
+    """Return the state at rest, crank upright, or that for the crank's angle and rate in `start`."""
     a = args.crank_length
     if start is None:
         crank, rate, rod = jnp.full_like(a, math.pi / 2), jnp.zeros_like(a), jnp.zeros_like(a)
@@ -79,8 +78,8 @@ def _initial_state(args: SliderCrankArgs, start: State | None) -> State:
 
 
 def _configuration(xp: ModuleType, crank: Any, a: Any, side: Any) -> tuple[Any, ...]:
-    """Slider and rod for a crank angle, then their first and second derivatives by it, in NumPy or
-    JAX; `side` is the sign of the cosine of the rod's angle."""
+    """Return slider and rod for a crank angle, then their first and second derivatives with respect to
+    it, in NumPy or JAX; `side` is the sign of the cosine of the rod's angle."""
     s, c = xp.sin(crank), xp.cos(crank)
     sin_rod = -a * s
     cos_rod = side * xp.sqrt(1 - sin_rod**2)
@@ -93,7 +92,7 @@ def _configuration(xp: ModuleType, crank: Any, a: Any, side: Any) -> tuple[Any, 
 
 
 def _exact(t: np.ndarray, args: SliderCrankArgs, y0: Any) -> tuple[np.ndarray, np.ndarray]:
-    """The equation of motion of the crank angle, `B = dq / d crank`:
+    """Integrate the equation of motion of the crank angle, `B = dq / d crank`:
 
     (B.M B) crank'' = B.Q - (B.M dB/d crank) crank'^2.
     """
@@ -150,17 +149,15 @@ def slider_crank(
     each of shape `(3,)`; four constraints, two positions and two velocities. From rest
     with the crank upright, $\alpha = \pi/2$, to `t = 10`.
 
-    The solution is an independent integration (SciPy's DOP853) of the equation of motion
-    of the crank's angle alone, to about 1e-13, from every initial state on the manifold.
-    The source prints 5 digits at `t = 2, 6, 10`
-    (`from manifold_jax.problems.slider_crank import PUBLISHED`).
+    The solution is an independent integration (SciPy's DOP853) of the equation of motion of the crank's
+    angle alone, to about 1e-13, from every initial state on the manifold. The source prints 5 digits at
+    `t = 2, 6, 10` (`from manifold_jax.problems.slider_crank import PUBLISHED`).
 
     **Arguments:**
 
-    - `stiffness` k, `damping` c and `spring_length` l0 of the spring, `push` F on the
-        slider, `crank_length` a < 1, `crank_inertia` J1, `slider_mass` m2, `rod_inertia` J2:
-        scalars, `args`. `with_args` keeps the crank's angle and rate, also those of an initial
-        state of yours.
+    - `stiffness` k, `damping` c and `spring_length` l0 of the spring, `push` F on the slider,
+        `crank_length` a < 1, `crank_inertia` J1, `slider_mass` m2, `rod_inertia` J2: scalars, `args`.
+        `with_args` keeps the crank's angle and rate, also those of an initial state of yours.
     - `t1`: the end of the time span.
 
     A known trap: the source prints the integral of the kinetic energy over the time span

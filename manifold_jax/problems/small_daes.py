@@ -42,9 +42,8 @@ def jay2() -> Problem:
 
     $$y_1' = y_1 y_2^2 z^2, \quad y_2' = y_1^2 y_2^2 - 3 y_2^2 z, \quad y_1^2 y_2 = 1,$$
 
-    from `(1, 1)` at `t = 0` to `t = 1`. Exact solution `(e^t, e^-2t)`, `z = e^2t`; known
-    from every initial state on the manifold. The state has shape `(2,)`; one constraint;
-    no parameters.
+    from `(1, 1)` at `t = 0` to `t = 1`. Exact solution `(e^t, e^-2t)`, `z = e^2t`; known from every
+    initial state on the manifold. The state has shape `(2,)`; one constraint; no parameters.
 
     Differentiating the constraint gives `2 y2 z^2 - 3 z + y1^2 = 0` for `z`.
 
@@ -157,10 +156,9 @@ def skate(*, slope: Any = 0.8) -> Problem:
 
     $$q'' = (\sin\alpha + w \sin t, -w \cos t), \quad q_2' \cos t - q_1' \sin t = 0,$$
 
-    with $q_1$ downhill and $w$ the force across the blade (mass and gravity one). From
-    rest at the origin at `t = 0` to `t = 10`. Exact solution
-    `q = sin(alpha)/2 (sin^2 t, t - sin(2t)/2)`: it drifts sideways, not downhill; known
-    from every initial state with its velocity along the blade.
+    with $q_1$ downhill and $w$ the force across the blade (mass and gravity one). From rest at the
+    origin at `t = 0` to `t = 10`. Exact solution `q = sin(alpha)/2 (sin^2 t, t - sin(2t)/2)`: it drifts
+    sideways, not downhill; known from every initial state with its velocity along the blade.
 
     The state is `(q, v)`, each of shape `(2,)`; one constraint.
 

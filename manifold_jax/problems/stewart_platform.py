@@ -16,7 +16,7 @@ State: TypeAlias = tuple[Pose, Pose]
 
 CYLINDERS = tuple(f"cylinder {i}" for i in range(1, 7))
 PISTONS = tuple(f"piston {i}" for i in range(1, 7))
-# Of the joints at base and platform, seen from above: pairs, at the platform turned by 60 degrees.
+# Angles of the joints, seen from above, in pairs; those of the platform are turned by 60 degrees.
 AT_BASE = tuple(math.radians(120 * (i // 2) + (-15, 15)[i % 2]) for i in range(6))
 AT_PLATFORM = tuple(math.radians(120 * (i // 2) + (-45, 45)[i % 2]) for i in range(6))
 # Centres of mass of cylinders and pistons from their ends, and their moments of inertia across
@@ -40,7 +40,7 @@ class StewartPlatformArgs(NamedTuple):
 
 
 def _points(xp: Any, args: Any) -> tuple[Any, Any, Any]:
-    """Joints at the base, in the platform's frame, and the first axes of the universal joints."""
+    """Return joints at base and platform, and the first axes of the universal joints."""
     dtype = args.base_radius.dtype
     circle = lambda angles: xp.asarray(
         np.stack([np.cos(angles), np.sin(angles), np.zeros(6)], axis=1), dtype
@@ -53,8 +53,8 @@ def _points(xp: Any, args: Any) -> tuple[Any, Any, Any]:
 
 
 def _legs(xp: Any, base: Any, ends: Any, first_axes: Any) -> tuple[Any, Any]:
-    """Lengths and frames of the legs, `(6, 3, 3)`: the columns are the second axis of the universal
-    joint, the normal of both, and the direction of the leg. Also of complex numbers."""
+    """Return lengths and frames of the legs, `(6, 3, 3)`: the columns are the second axis of the
+    universal joint, the normal of both, and the direction of the leg. Also for complex numbers."""
     span = ends - base
     length = xp.sqrt(xp.sum(span * span, axis=-1))
     n = span / length[:, None]
@@ -64,9 +64,9 @@ def _legs(xp: Any, base: Any, ends: Any, first_axes: Any) -> tuple[Any, Any]:
 
 
 def _leg_motion(xp: Any, points: tuple, x: Any, R: Any, u: Any, w: Any) -> tuple[Any, ...]:
-    """Of position, rotation and twists `(..., 3)` of the platform: the upper ends of the legs and
-    their velocities, the frames of the legs, rates of the directions, and angular velocities.
-    The universal joint decides about the spin: its second axis stays perpendicular to its first."""
+    """Return, for position, rotation and twists `(..., 3)` of the platform, the upper ends of the legs
+    and their velocities, the frames of the legs, rates of the directions, and angular velocities. The
+    universal joint determines the spin: its second axis stays perpendicular to its first."""
     base, local, first_axes = points
     arms = local @ R.T
     ends = arms + x[None, :]
@@ -81,7 +81,7 @@ def _leg_motion(xp: Any, points: tuple, x: Any, R: Any, u: Any, w: Any) -> tuple
 
 
 def assembly(args: StewartPlatformArgs) -> Assembly:
-    """The platform as drawn: level, at its height."""
+    """Return the platform as drawn: level, at its height."""
     base, local, first_axes = _points(jnp, args)
     zero = jnp.zeros_like(args.height)
     center = jnp.stack([zero, zero, args.height])
@@ -117,14 +117,14 @@ def _quaternions(xp: Any, frames: Any) -> Any:
 
 
 def _spinning(xp: Any, p: Any, spin: Any) -> Any:
-    """Rates of quaternions for angular velocities in space."""
+    """Return rates of quaternions for angular velocities in space."""
     a, v = p[..., :1], p[..., 1:]
     scalar = -xp.sum(v * spin, axis=-1)[..., None]
     return xp.concatenate([scalar, a * spin + xp.cross(spin, v)], axis=-1) / 2
 
 
 def _spin(xp: Any, p: Any, p_rate: Any) -> Any:
-    """The angular velocity in space."""
+    """Return the angular velocity in space."""
     return 2 * (p[0] * p_rate[1:] - p_rate[0] * p[1:] + xp.cross(p[1:], p_rate[1:]))
 
 
@@ -136,13 +136,13 @@ def _rotation(xp: Any, p: Any) -> Any:
 
 
 def _initial_state(args: StewartPlatformArgs, start: State) -> State:
-    """Pose and velocities of the platform of `start`, with the lengths of `args`."""
+    """Return the state for pose and velocities of the platform in `start`, with the lengths of `args`."""
     q, v = start
     return _bodies(jnp, q.position[0], q.orientation[0], v.position[0], v.orientation[0], args)
 
 
 def _bodies(xp: Any, x: Any, p: Any, u: Any, p_rate: Any, args: Any) -> State:
-    """All bodies, from the platform."""
+    """Return all bodies, from the platform."""
     points = _points(xp, args)
     base, R, spin = points[0], _rotation(xp, p), _spin(xp, p, p_rate)
     ends, moving, frames, turning, spins = _leg_motion(xp, points, x, R, u, spin)
@@ -157,8 +157,8 @@ def _bodies(xp: Any, x: Any, p: Any, u: Any, p_rate: Any, args: Any) -> State:
 
 
 def _exact(t: np.ndarray, args: StewartPlatformArgs, y0: Any) -> State:
-    """Kane's equations of the platform alone, whose twist decides about the velocities of all bodies;
-    the accelerations that are left when its twist is constant by a complex step."""
+    """Integrate Kane's equations of the platform alone, whose twist determines the velocities of all
+    bodies; the accelerations that are left when its twist is constant by a complex step."""
     q, v = y0
     twist = _twist_equation(args)
     x, p, u, p_rate = q.position[0], q.orientation[0], v.position[0], v.orientation[0]
@@ -176,7 +176,7 @@ def _exact(t: np.ndarray, args: StewartPlatformArgs, y0: Any) -> State:
 
 
 def _twist_equation(args: StewartPlatformArgs) -> Any:
-    """The acceleration and angular acceleration of the platform."""
+    """Return the acceleration and angular acceleration of the platform."""
     base, local, first_axes = points = _points(np, args)
     size, tiny = float(args.platform_radius), 1e-30
     masses = np.array([args.platform_mass] + [args.leg_mass] * 12)
@@ -184,8 +184,7 @@ def _twist_equation(args: StewartPlatformArgs) -> Any:
     disc = np.array([0.25, 0.25, 0.5]) * args.platform_mass * size**2
 
     def velocities(x, R, u, w):
-        """Return the velocities of centres of mass and of turning, `(..., 13, 3)`, for twists
-        `(..., 3)`."""
+        """Return velocities of centres of mass and of turning, `(..., 13, 3)`, for twists `(..., 3)`."""
         _, moving, _, turning, spins = _leg_motion(np, points, x, R, u, w)
         c = CENTER * size
         linear = np.concatenate([u[..., None, :], c * turning, moving - c * turning], axis=-2)
@@ -253,10 +252,9 @@ def stewart_platform(
 
     **Arguments:**
 
-    - `base_radius`, `platform_radius`, `height` of the platform in the drawing (m),
-        `platform_mass`, `leg_mass` of each cylinder and piston (kg), `stiffness` (N/m) and
-        `rest_length` (m) of the legs, `gravity` (m/s^2): `args`. `with_args` keeps pose and
-        velocities of the platform.
+    - `base_radius`, `platform_radius`, `height` of the platform in the drawing (m), `platform_mass`,
+        `leg_mass` of each cylinder and piston (kg), `stiffness` (N/m) and `rest_length` (m) of the
+        legs, `gravity` (m/s^2): `args`. `with_args` keeps pose and velocities of the platform.
     - `velocity` (m/s) and `spin` (rad/s, in space) of the platform at `t = 0`, shape `(3,)`.
     - `t1`: the end of the time span (s).
 

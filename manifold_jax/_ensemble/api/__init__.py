@@ -1,1 +1,1 @@
-"""`solve_ensemble` and `stream_ensemble`: what users call for many trajectories."""
+"""The front ends for many trajectories: `solve_ensemble` and `stream_ensemble`."""

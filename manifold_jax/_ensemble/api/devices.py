@@ -1,4 +1,4 @@
-"""The trajectories of an ensemble, shared out among devices."""
+"""Ensembles on several devices."""
 
 import dataclasses
 from collections.abc import Callable
@@ -42,12 +42,14 @@ def check_mesh(mesh: Any, solver: dfx.AbstractSolver) -> None:
 def over_devices(
     solve: Callable[[Inputs, Axes], EnsembleSolution], inputs: Inputs, mesh: Mesh
 ) -> EnsembleSolution:
-    """`solve` on every device, each with an equal share of the trajectories; in their order.
+    """Return the results of `solve` on every device, each with an equal share of the trajectories, in
+    their order.
 
-    Nothing is sent between devices while they solve. Derivatives with respect to what all
-    trajectories have in common are added up after each device has gone back through its share."""
+    Nothing is sent between devices while they solve. Derivatives with respect to what all trajectories
+    have in common are summed after each device has gone back through its share.
+    """
     equations, batch = inputs
-    # Without axes that are explicit, whose sizes would have to divide the number of trajectories.
+    # Not with explicit axes, whose sizes would have to divide the number of trajectories.
     mesh = Mesh(mesh.devices, mesh.axis_names)
     share = -(-batch.size // mesh.size)
     missing, each = share * mesh.size - batch.size, batch.each
@@ -66,18 +68,18 @@ def over_devices(
         mesh=mesh,
         in_specs=(PartitionSpec(), shared),
         out_specs=shared,
-        check_vma=False,  # Diffrax's loops mix what differs between devices and what does not
+        check_vma=False,  # Diffrax's loops mix values that differ between devices with others
     )(common, each)
     shortened = lambda x: _on_all(_on_all(x, mesh)[: batch.size], mesh)
     return jtu.tree_map(shortened, solution) if missing else solution
 
 
 def _lengthened(x: Array, missing: int, mesh: Mesh) -> Array:
-    """Lengthen an array by copies of the last trajectory."""
+    """Pad an array with copies of the last trajectory."""
     x = _on_all(x, mesh)
     return _on_all(jnp.concatenate([x, jnp.repeat(x[-1:], missing, axis=0)]), mesh)
 
 
 def _on_all(x: Array, mesh: Mesh) -> Array:
-    """Wholly on every device: what does not divide among them is not sent around piece by piece."""
+    """Replicate arrays that cannot be shared equally, instead of sending them around piece by piece."""
     return jax.lax.with_sharding_constraint(x, NamedSharding(mesh, PartitionSpec()))

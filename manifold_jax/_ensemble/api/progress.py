@@ -1,12 +1,12 @@
-"""How far a long run is: a bar on a terminal, lines in a file, a pipe or a notebook."""
+"""Progress of a long run: a bar on a terminal, lines in a file, a pipe or a notebook."""
 
 import time
 
 from ..._base.extras import NoBar, print_line, terminal_bar
 
 
-class Meter:
-    """Silent unless `shown`. Lines are at least a second apart, and a tenth of the time gone by."""
+class ChunkMeter:
+    """Silent unless `shown`. Lines are at least a second and a tenth of the elapsed time apart."""
 
     def __init__(self, size: int, finished: int, failed: int, shown: bool):
         self.size = size
@@ -17,7 +17,7 @@ class Meter:
         self.task = self.bar.add_task("ensemble", total=size, completed=finished, rate="")
         self.begun = self.last = time.perf_counter()
 
-    def __enter__(self) -> "Meter":
+    def __enter__(self) -> "ChunkMeter":
         self.bar.start()
         return self
 

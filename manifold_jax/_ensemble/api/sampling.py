@@ -1,4 +1,4 @@
-"""Trajectories made from their numbers, some of them at a time."""
+"""Trajectories generated from their indices, in batches."""
 
 from collections.abc import Callable
 from typing import Any
@@ -12,8 +12,8 @@ from jaxtyping import Array
 
 
 def drawn(sample: Callable, t0: Any, t1: Any, key: Array, index: Array) -> dict[str, Any]:
-    """Arguments of `solve_ensemble`, for the trajectories numbered `index`. What of `args` depends
-    neither on the number nor on the key stays what all have in common."""
+    """Return the arguments of `solve_ensemble` for the trajectories with these indices. Arrays in
+    `args` that depend neither on the index nor on the key stay common to all."""
     keys = jax.vmap(jax.random.fold_in, in_axes=(None, 0))(key, index)
     own, common = _common(sample, index[0], keys[0])
 
@@ -34,7 +34,7 @@ def drawn(sample: Callable, t0: Any, t1: Any, key: Array, index: Array) -> dict[
 
 
 def _common(sample: Callable, index: Array, key: Array) -> tuple[Any, Any]:
-    """Which leaves of `args` are computed, and the others, which do not depend on anything."""
+    """Return which leaves of `args` are computed, and the others, which do not depend on anything."""
     args = None
 
     def look(index: Array, key: Array) -> None:

@@ -1,4 +1,4 @@
-"""What a stored ensemble was computed with, to refuse another that would be mixed into it."""
+"""The settings of a stored ensemble, compared before another run continues it."""
 
 import hashlib
 import re
@@ -11,18 +11,18 @@ import jax.tree_util as jtu
 import numpy as np
 
 
-# Of which another version may round otherwise.
+# Packages whose versions may change the rounding.
 _PACKAGES = ("manifold_jax", "diffrax", "equinox", "jax", "jaxlib")
 _IN_PROGRAM = ("sample", "terms", "solver", "t0", "t1", "dt0", "saveat", "stepsize_controller")
 
 
 def settings_of(given: dict[str, Any], program: str) -> dict[str, Any]:
-    """Return the settings as JSON has them. `program`: what was traced, before it is compiled."""
-    words = {name: _described(value) for name, value in given.items()}
+    """Return the settings as JSON values. `program` is the traced program before compilation."""
+    described = {name: _described(value) for name, value in given.items()}
     device = jax.devices()[0]
     versions = {f"version of {name}": version(name) for name in _PACKAGES}
     return {
-        **words,
+        **described,
         "device": f"{device.platform}, {device.device_kind}",
         "x64": bool(jax.config.read("jax_enable_x64")),
         **versions,
@@ -31,7 +31,7 @@ def settings_of(given: dict[str, Any], program: str) -> dict[str, Any]:
 
 
 def _described(value: Any) -> Any:
-    """Numbers and words as they are, anything else as it is written, without addresses."""
+    """Return numbers and strings as they are, anything else as its text without addresses."""
     if value is None or isinstance(value, bool | int | float | str):
         return value
     if isinstance(value, np.generic | np.ndarray | jax.Array):
@@ -40,8 +40,7 @@ def _described(value: Any) -> Any:
 
 
 def _fingerprint(program: str, inputs: Any) -> str:
-    """Return a fingerprint of a program and of the arrays it is called with, those in functions
-    included."""
+    """Return a fingerprint of a program and of its input arrays, those in functions included."""
     digest = hashlib.sha256(program.encode())
     for leaf in jtu.tree_leaves(eqx.filter(inputs, eqx.is_array)):
         digest.update(np.asarray(leaf).tobytes())
@@ -49,10 +48,10 @@ def _fingerprint(program: str, inputs: Any) -> str:
 
 
 def check_settings(path: Any, stored: dict[str, Any], now: dict[str, Any]) -> None:
-    """Refuse to go on with other settings, and say which."""
+    """Refuse to continue with other settings, and name them."""
     names = [name for name in now | stored if stored.get(name) != now.get(name)]
     if "program" not in names:
-        # Then names of functions are all that can differ in how these are written.
+        # Then these differ only by the names of functions in their text.
         names = [name for name in names if name not in _IN_PROGRAM]
     if names == ["program"]:
         raise ValueError(

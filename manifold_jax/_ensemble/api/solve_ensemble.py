@@ -30,8 +30,11 @@ from ..lanes.arguments import (
 from ..lanes.execution import solve_on_one_device
 from ..lanes.parts import Inputs
 from ..lanes.solution import EnsembleSolution, messages_of
-from ..lanes.trajectory import Equations
+from ..lanes.trajectory import LaneEquations
 from .devices import check_mesh, over_devices
+
+
+DEFAULT_LANES = 128
 
 
 @refuse_old_names(in_axes="args_axes")
@@ -52,7 +55,7 @@ def solve_ensemble(
     stepsize_controller: dfx.AbstractStepSizeController = dfx.ConstantStepSize(),
     max_steps: int = 4096,
     args_axes: Any = None,
-    lanes: int = 128,
+    lanes: int = DEFAULT_LANES,
     adjoint: dfx.AbstractAdjoint = StepReplayAdjoint(),
     mesh: Mesh | None = None,
     throw: bool = False,
@@ -69,29 +72,28 @@ def solve_ensemble(
 
     **Arguments:** as [`diffeqsolve`][], and
 
-    - `y0s`: initial values, any pytree; the leading axis of each leaf is that of the `N`
-        trajectories.
+    - `y0s`: initial values, any pytree; the leading axis of each leaf is that of the `N` trajectories.
     - `t0`, `t1`: common to all, or of shape `(N,)`.
-    - `args`, `args_axes`: what of `args` each trajectory has of its own: 0 for a leading axis, `None`
-        for what is common to all, by default everything; a prefix of the tree of `args`.
+    - `args`, `args_axes`: a prefix of the tree of `args` with 0 for leaves that have a leading axis of
+        trajectories, and `None` for those common to all; by default all are common.
     - `saveat`: the end, `SaveAt(t1=True)`, the start, times (common to all), and functions of them.
     - `lanes`: how many trajectories advance together, on each device.
     - `adjoint`: the mode of differentiation: reverse, or `diffrax.ForwardMode()` for `jax.jvp` and
         `jax.jacfwd`. Both make the steps again that the solve made.
     - `mesh`: a `jax.sharding.Mesh`, e.g. `jax.make_mesh((jax.device_count(),), ("trajectories",))`: each of
-        its devices, over all of its axes, solves an equal share of the trajectories in lanes of its
-        own. What is returned is sharded along the trajectories if their number divides among the devices, and
-        whole on each of them if not. Nothing is sent between devices until they are done, and for gradients
-        with respect to what is common to all one sum. Of several processes (`jax.distributed`) each passes the
-        same arguments. For explicit solvers. By default one device solves all.
-    - `throw`: raise a `RuntimeError` if any trajectory fails. By default it has a result code, and
-        the others are what they are without it.
+        its devices, over all of its axes, solves an equal share of the trajectories in its own lanes.
+        Results are sharded along the trajectories if their number is a multiple of that of the devices, and
+        replicated otherwise. Nothing is sent between devices until they are done; gradients with respect
+        to common arguments take one sum. All processes (`jax.distributed`) pass the same arguments. For
+        explicit solvers. By default one device solves all.
+    - `throw`: raise a `RuntimeError` if any trajectory fails. By default it gets a result code, and
+        the others are not affected.
 
     Explicit Runge-Kutta methods, in a hook or alone, and [`Rodas5P`][] and [`Rodas3P`][] alone for up
-    to eight unknowns, with constant steps or `diffrax.PIDController`, are advanced so. Other solvers,
+    to eight unknowns, with constant steps or `diffrax.PIDController`, are advanced in lanes. Other solvers,
     mass matrices, other controllers and systems too large to be written out number by number are
     solved by `diffeqsolve` under `jax.lax.map` in batches of `lanes`. `execution` of the solution says
-    which way was taken, and why.
+    which of the two was used, and why.
 
     **Returns:**
 
@@ -101,7 +103,7 @@ def solve_ensemble(
     **Raises:**
 
     As `diffeqsolve`, `ValueError` for leading axes that disagree, and for a `mesh` without devices or
-    with an implicit solver, and `TypeError` for a `mesh` that is none.
+    with an implicit solver, and `TypeError` for a `mesh` of another type.
     """
     if mesh is not None:
         check_mesh(mesh, solver)
@@ -112,7 +114,7 @@ def solve_ensemble(
     one = jax.eval_shape(batch.one)
     warn_of_rounding(one.y0, batch.dtype, stepsize_controller)
     solver = without_idle_hook(solver, one.t0, one.y0, one.args)
-    equations = Equations(
+    equations = LaneEquations(
         terms, solver, stepsize_controller, saveat, dt0, adjoint, max_steps, lanes, consistent
     )
 
@@ -139,7 +141,7 @@ def solve_ensemble(
 
 
 def _example(batch: Batch) -> str:
-    """Describe one trajectory, for errors in what the user wrote."""
+    """Describe one trajectory, for errors in the user's functions."""
     one = jax.eval_shape(batch.one)
     return (
         f"Of the {batch.size} trajectories of `y0s` each has a state of shapes {jtu.tree_map(jnp.shape, one.y0)}: the "

@@ -1,4 +1,4 @@
-"""Ensembles of any size: chunk by chunk to the disk."""
+"""Ensembles of any size, written to disk chunk by chunk."""
 
 import errno
 import operator
@@ -30,13 +30,13 @@ from ..stored.arrays import (
 from ..stored.faults import faults_of_chunks, faults_of_descriptions, finished_chunks
 from ..stored.lock import LOCK_FILE, only_writer
 from ..stored.store import stored_at, StoredEnsemble
-from .progress import Meter
+from .progress import ChunkMeter
 from .sampling import drawn
 from .settings import check_settings, settings_of
-from .solve_ensemble import solve_ensemble
+from .solve_ensemble import DEFAULT_LANES, solve_ensemble
 
 
-# Numbers of trajectories are 32-bit integers where JAX has no others.
+# Indices of trajectories are 32-bit integers unless JAX has 64 bits enabled.
 _LARGEST_SIZE = 2**31 - 1
 
 
@@ -55,15 +55,15 @@ def stream_ensemble(
     saveat: dfx.SaveAt = dfx.SaveAt(t1=True),
     stepsize_controller: dfx.AbstractStepSizeController = dfx.ConstantStepSize(),
     max_steps: int = 4096,
-    lanes: int = 128,
+    lanes: int = DEFAULT_LANES,
     consistent: Consistent = "project",
     chunk: int = 8192,
     seed: int = 0,
     resume: bool = False,
     progress: bool = True,
 ) -> StoredEnsemble:
-    """Solve for more trajectories than fit into memory, or than one dares to lose: make them one
-    chunk at a time, solve them with [`solve_ensemble`][] and write them to a folder.
+    """Solve for more trajectories than fit into memory, or than you can afford to lose: generate them
+    chunk by chunk, solve them with [`solve_ensemble`][] and write them to a folder.
 
     ```python
     def sample(index, key):  # of one trajectory, any JAX code
@@ -80,7 +80,7 @@ def stream_ensemble(
 
     Memory is that of one chunk, whatever the `size`. A run that was interrupted, also by a
     killed process, is continued by the same call with `resume=True`: at most one chunk is computed
-    again, and the files are bit by bit those of a run without interruption (on the same kind of
+    again, and the files are bit-identical to those of a run without interruption (on the same kind of
     device and with the same versions). Every file is written under another name and then renamed.
 
     **Arguments:**
@@ -88,7 +88,7 @@ def stream_ensemble(
     - `sample`: `(index, key) -> (y0, args)`, the initial value and the parameters of the trajectory
         numbered `index`, from 0 on; `key` is `jax.random.fold_in(jax.random.key(seed), index)`.
         Traced and mapped over: write it with `jax.numpy`. It must depend on nothing else that changes.
-        What it returns in `args` as it is, without computing it, is common to all.
+        Leaves of `args` that it does not compute are common to all.
     - `size`: the number of trajectories.
     - `path`: the folder; made if it does not exist, and refused if it is not empty unless `resume`.
     - `terms`, `solver`, `dt0`, `saveat`, `stepsize_controller`, `max_steps`, `lanes`, `consistent`:
@@ -97,9 +97,9 @@ def stream_ensemble(
     - `chunk`: how many trajectories are solved and written together. Much larger than `lanes`, as
         lanes run empty at the end of each chunk.
     - `seed`: of the random numbers.
-    - `resume`: continue what is in `path`, or begin if there is nothing. Chunks that are missing or
+    - `resume`: continue the run in `path`, or begin one if the folder is empty. Chunks that are missing or
         damaged are computed again. Refused if the settings stored there differ, `terms`, constraint
-        and `sample` included, but for what a `jax.pure_callback` calls, which cannot be seen.
+        and `sample` included, except for the function that a `jax.pure_callback` calls.
     - `progress`: show how far it is, trajectories per second, and how many have failed.
 
     **Returns:**
@@ -146,7 +146,7 @@ def stream_ensemble(
 
 
 def _compute(stored: StoredEnsemble, lowered: Any, call: Callable, progress: bool) -> None:
-    """The chunks that are not there, or not as they were written."""
+    """Compute the chunks that are missing or damaged."""
     size, chunk = stored.size, stored.chunk
     damaged = {fault.chunk for fault in faults_of_chunks(stored.group)}
     whole = [k for k in finished_chunks(stored.group) if k not in damaged]
@@ -154,7 +154,7 @@ def _compute(stored: StoredEnsemble, lowered: Any, call: Callable, progress: boo
     count = lambda start: min(chunk, size - start)
     finished = size - sum(map(count, starts))
     failed = sum(np.count_nonzero(stored.result[k * chunk : (k + 1) * chunk]) for k in whole)
-    with Meter(size, finished, int(failed), progress) as meter:
+    with ChunkMeter(size, finished, int(failed), progress) as meter:
         if starts:
             meter.compiling()
             program = lowered.compile()
@@ -169,7 +169,7 @@ def _compute(stored: StoredEnsemble, lowered: Any, call: Callable, progress: boo
 def _solve_chunk(
     given: dict[str, Any], key: Array, start: Array, size: int, chunk: int
 ) -> dict[str, Any]:
-    """The same program for every chunk: the last trajectory fills the last one up."""
+    """Solve a chunk, filled up with copies of the last trajectory: all chunks share one program."""
     index = jnp.minimum(start + jnp.arange(chunk), size - 1)
     samples = drawn(given["sample"], given["t0"], given["t1"], key, index)
     options = {name: x for name, x in given.items() if name != "sample"} | samples
@@ -181,7 +181,7 @@ def _solve_chunk(
 def _opened(
     out: Path, settings: dict[str, Any], messages: Sequence[str], examples: Any, resume: bool
 ) -> StoredEnsemble:
-    """The folder, new or as it is, with those settings and all of its arrays."""
+    """Open the folder, new or existing, with these settings and all of its arrays."""
     with clear_write_errors(out):
         files = [file for file in out.iterdir() if file.name != LOCK_FILE]
     if all(resume and is_partial(file) for file in files):

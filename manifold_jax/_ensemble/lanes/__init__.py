@@ -4,7 +4,7 @@ The life of a lane, with the file of each part:
 
 1. `arguments.py` checks the leading axes; `trajectory.py` begins a trajectory: a consistent start, the
    first step, the state of the controller.
-2. `schedule.py` runs the loop. In each turn every lane attempts one step (`Equations.attempt`), keeps
+2. `schedule.py` runs the loop. In each turn every lane attempts one step (`LaneEquations.attempt`), keeps
    it or takes a smaller one, and saves what lies within it.
 3. A lane whose trajectory has ended, or failed, writes its outcome and takes the next trajectory at
    once. The loop ends when there is none left.

@@ -1,4 +1,4 @@
-"""What each trajectory has of its own, and what all have in common."""
+"""The arguments that each trajectory has of its own, and those that are common to all."""
 
 from typing import Any
 
@@ -15,16 +15,16 @@ from ..._base.types import Args, Y
 from ..._constraint.checks import check_state
 from ..._solve.prepare import time_dtype
 from ..._solve.times import is_no_step, NO_FIRST_STEP, NO_OUTPUT_TIME
-from .trajectory import end_floor, Given
+from .trajectory import end_floor, TrajectoryData
 
 
-# Names of the axes of a mesh over which trajectories are shared out; none on one device.
+# Names of the axes of a mesh over which trajectories are distributed; none on one device.
 Axes = tuple[str, ...]
 
 
 def largest(x: Array, axes: Axes) -> Array:
-    """Return the largest value of all trajectories. Every process raises what one has to raise:
-    else it would wait for it."""
+    """Return the largest value over all trajectories. All processes get the same one and raise
+    together: a process that raised alone would leave the others waiting."""
     return lax.pmax(jnp.max(x), axes) if axes else jnp.max(x)
 
 
@@ -33,36 +33,36 @@ def anywhere(x: Array, axes: Axes) -> Array:
 
 
 class Batch(eqx.Module):
-    """The fields of [`Given`][], split into leaves with the trajectories in front, and common ones."""
+    """The fields of [`TrajectoryData`][], split into leaves with the trajectories in front, and common ones."""
 
     each: Any
     common: Any
     dtype: Any = eqx.field(static=True)
     size: int = eqx.field(static=True)
 
-    def complete(self, each: Any) -> Given:
+    def complete(self, each: Any) -> TrajectoryData:
         """Return the arguments of one trajectory, from its part of `each`."""
         given = eqx.combine(each, self.common)
         t0, t1 = jnp.asarray(given.t0, self.dtype), jnp.asarray(given.t1, self.dtype)
         return given._replace(t0=t0, t1=t1)
 
-    def one(self) -> Given:
-        """An example."""
+    def one(self) -> TrajectoryData:
+        """Return an example."""
         return self.complete(jtu.tree_map(lambda x: x[0], self.each))
 
 
 def checked_batch(
     t0: Any, t1: Any, dt0: Any, y0s: Y, args: Args, args_axes: Any, saveat: dfx.SaveAt, lanes: int
 ) -> Batch:
-    """Refuse leading axes that do not fit, naming the argument."""
+    """Check the leading axes; errors name the argument."""
     if not isinstance(lanes, int) or lanes < 1:
         raise ValueError(f"`lanes` must be a positive integer, got {lanes!r}.")
     check_state(y0s, "y0s")
     y0s = jtu.tree_map(jnp.asarray, y0s)
     timed = tuple(eqx.is_array(t) and t.ndim > 0 for t in (t0, t1))
     axes = jtu.tree_map(lambda _: True, y0s), _axes(args_axes, args)
-    mask = Given._make((*timed, *axes, any(timed)))
-    own = eqx.filter(Given._make((t0, t1, y0s, args, None)), mask)
+    mask = TrajectoryData._make((*timed, *axes, any(timed)))
+    own = eqx.filter(TrajectoryData._make((t0, t1, y0s, args, None)), mask)
     parts = {"y0s": own.y0, "t0": own.t0, "t1": own.t1, "args": own.args}
     leaves = [(name, x) for name in parts for x in jtu.tree_leaves_with_path(parts[name])]
     sizes = {f"{name}{jtu.keystr(path)}": _size(x) for name, (path, x) in leaves}
@@ -70,7 +70,7 @@ def checked_batch(
     start, end = (t if np.ndim(t) == 0 else t[0] for t in (t0, t1))
     dtype = time_dtype(start, end, dt0, saveat)
     floor = end_floor(jnp.asarray(t0, dtype), jnp.asarray(t1, dtype))
-    each, common = eqx.partition(Given(t0, t1, y0s, args, floor), mask)
+    each, common = eqx.partition(TrajectoryData(t0, t1, y0s, args, floor), mask)
     return Batch(each, common, dtype, next(iter(sizes.values())))  # pyright: ignore[reportArgumentType, reportCallIssue]
 
 
@@ -95,8 +95,8 @@ def checked_times(saveat: dfx.SaveAt, batch: Batch, axes: Axes) -> dfx.SaveAt:
         t0, t1 = _ends(batch)
         direction = jnp.where(t0 < t1, 1, -1).astype(ts.dtype)[:, None]
         ahead = ts[None] * direction
-        before, behind = t0[:, None] * direction, t1[:, None] * direction
-        outside = anywhere((ahead < before) | (ahead > behind), axes)
+        start, end = t0[:, None] * direction, t1[:, None] * direction
+        outside = anywhere((ahead < start) | (ahead > end), axes)
         unsorted = anywhere(ahead[:, 1:] < ahead[:, :-1], axes)
         ts = eqx.error_if(ts, jnp.isnan(ts), NO_OUTPUT_TIME)
         ts = eqx.error_if(ts, unsorted, "`saveat.ts` must be sorted from t0 to t1.")
@@ -111,8 +111,8 @@ def checked_times(saveat: dfx.SaveAt, batch: Batch, axes: Axes) -> dfx.SaveAt:
 
 
 def _ends(batch: Batch) -> tuple[Array, Array]:
-    """Return the ends of the time of each trajectory; where all have the same, of one: XLA takes
-    seconds to compute while compiling what thousands of equal constants amount to."""
+    """Return `t0` and `t1` of each trajectory, or of one if all have the same: XLA takes seconds to
+    fold thousands of equal constants at compile time."""
     t0, t1, *_ = batch.common
     if t0 is not None and t1 is not None:
         return jnp.asarray(t0, batch.dtype)[None], jnp.asarray(t1, batch.dtype)[None]

@@ -1,4 +1,4 @@
-"""Columns, one number of each lane or each trajectory, stacked and in tables."""
+"""Columns, one number of each lane or each trajectory, stacked into arrays and tables."""
 
 from typing import Any
 
@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 
-from ..._jaxpr.lane_value import Columns, Layout
+from ..._jaxpr.lane_value import ColumnLayout, Columns
 
 
 def taken(tree: Any, index: jax.Array) -> Any:
@@ -20,10 +20,10 @@ def added(totals: Any, more: Any, active: jax.Array) -> Any:
 
 
 class Stacked(eqx.Module):
-    """Columns as one array for each type of number; with further leading axes many of them."""
+    """Columns stacked into one array for each dtype; further leading axes hold many of them."""
 
     arrays: dict[str, jax.Array]
-    layout: Layout = eqx.field(static=True)
+    layout: ColumnLayout = eqx.field(static=True)
 
     @staticmethod
     def of(columns: Columns) -> "Stacked":
@@ -40,19 +40,19 @@ class Stacked(eqx.Module):
 
 
 def unknown(dtype: Any) -> Any:
-    """Return what stands where nothing was computed: infinity, where numbers can be infinite."""
+    """Return the value of numbers that were not computed: infinity, or 0 if the dtype has none."""
     return np.inf if jnp.issubdtype(dtype, jnp.floating) else 0
 
 
-def empty_table(layout: Layout, rows: int) -> Stacked:
-    """A table of `rows` trees, each a row of the array of each type of number."""
+def empty_table(layout: ColumnLayout, rows: int) -> Stacked:
+    """Return a table of `rows` trees, one row of each array per tree."""
     dtypes = [str(dtype) for dtype in layout.dtypes_of_columns()]
     full = lambda dtype: jnp.full((rows, dtypes.count(dtype)), unknown(dtype), dtype)
     return Stacked({dtype: full(dtype) for dtype in dict.fromkeys(dtypes)}, layout)
 
 
 def written(table: Stacked, place: jax.Array, columns: Columns) -> Stacked:
-    """Numbers of each lane in a row of their own; none where `place` is behind the last one."""
+    """Write the numbers of each lane to the row `place`; none if that is beyond the last row."""
     write = lambda x, new: x.at[place].set(new.T, mode="drop")
     return Stacked(jtu.tree_map(write, table.arrays, Stacked.of(columns).arrays), table.layout)
 

@@ -1,4 +1,4 @@
-"""How an ensemble is solved: in lanes where that is possible, else mapped over."""
+"""The choice between the two ways to solve an ensemble: in lanes if possible, else mapped."""
 
 import dataclasses
 
@@ -19,15 +19,15 @@ from .parts import Inputs
 from .solution import EnsembleSolution
 
 
-# Unknowns up to which the elimination of a Rosenbrock method is written out in lanes: for five (eight)
-# in 0.1 (0.17) of the time of `vmap`, jaxlib 0.12.0.1. Beyond it compiling takes too long.
+# Largest number of unknowns for which the elimination of a Rosenbrock method is written out in lanes:
+# five (eight) take 0.1 (0.17) of the time of `vmap`, jaxlib 0.12.0.1. More take too long to compile.
 LARGEST_STIFF = 8
 
 
 def solve_on_one_device(inputs: Inputs) -> EnsembleSolution:
     solver = inputs.equations.solver
     if not isinstance(solver, AbstractManifoldSolver):
-        # Lanes advance solvers of this library, of which one leaves states as they are.
+        # Lanes advance solvers of this library, one of which leaves states unchanged.
         inputs = inputs.with_solver(Unconstrained(solver))
     obstacle = _obstacle(inputs)
     if obstacle is None:
@@ -46,7 +46,7 @@ def solve_on_one_device(inputs: Inputs) -> EnsembleSolution:
 
 
 def _obstacle(inputs: Inputs) -> str | None:
-    """What keeps trajectories out of lanes."""
+    """Return the reason why trajectories cannot be solved in lanes, if there is one."""
     equations, batch = inputs
     one, saveat, solver = batch.one(), equations.saveat, equations.solver
     if not isinstance(equations.terms, dfx.ODETerm | DirectedTerm):

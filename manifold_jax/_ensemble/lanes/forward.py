@@ -13,17 +13,17 @@ from .functions import begin, save, smooth_part, step_state
 from .parts import in_steps, Inputs, Parts
 from .rows import like, smooth_rows
 from .schedule import Schedule
-from .trajectory import Attempt, Equations, Given, Outcome, Start, Trajectory
+from .trajectory import Attempt, LaneEquations, LaneOutcome, LaneStart, Trajectory, TrajectoryData
 
 
 class GivenTangent(NamedTuple):
-    """What a trajectory has of its own, and its tangent; and the trajectory that this is."""
+    """The data that a trajectory has of its own, their tangent, and the trajectory that they define."""
 
     each: Any
     rest: Any
     tangent: Any
-    equations: Equations
-    given: Given
+    equations: LaneEquations
+    given: TrajectoryData
 
     @property
     def direction(self) -> FloatScalar:
@@ -31,14 +31,14 @@ class GivenTangent(NamedTuple):
 
 
 class Moving(NamedTuple):
-    """A trajectory with the tangent of what its next step depends on."""
+    """A trajectory with the tangent of the part that its next step depends on."""
 
     trajectory: Trajectory
     tangent: Any
 
 
 class Tangents:
-    """[`Equations`][] for pairs of what they are for and its tangent, with the same steps."""
+    """The methods of [`LaneEquations`][] for pairs of a value and its tangent, with the same steps."""
 
     def __init__(self, parts: Parts, common_tangent: Any):
         self.parts, self.common_tangent = parts, common_tangent
@@ -49,12 +49,12 @@ class Tangents:
         return GivenTangent(*of_each, *self.parts.one(each, self.parts.common, rest))
 
     def _along(self, function: Any, given: GivenTangent, x: Any, dx: Any, *args: Any) -> Any:
-        """Differentiate along a tangent: what a function returns (see `functions.py`), the tangent
-        of its real numbers between them."""
+        """Differentiate along a tangent: return the results of a function (see `functions.py`), with
+        the tangent of its real numbers between them."""
         at, along = (given.each, self.parts.common, x), (given.tangent, self.common_tangent, dx)
         return jax.jvp(self.parts.smooth(function, given.rest, *args), at, along, has_aux=True)
 
-    def begin(self, given: GivenTangent) -> Start:
+    def begin(self, given: GivenTangent) -> LaneStart:
         _, tangent, start = self._along(begin, given, None, None)
         return start._replace(trajectory=Moving(start.trajectory, tangent))
 
@@ -65,7 +65,7 @@ class Tangents:
         before = moving.trajectory
         smooth, discrete = eqx.partition(step_state(before), eqx.is_inexact_array)
 
-        def attempt(equations: Equations, given: Given, smooth: Any) -> Any:
+        def attempt(equations: LaneEquations, given: TrajectoryData, smooth: Any) -> Any:
             y, memory = eqx.combine(smooth, discrete)
             state = with_memory(before.solver_state, memory)
             tried = equations.attempt(given, before._replace(y=y, solver_state=state))
@@ -90,15 +90,15 @@ class Tangents:
         _, tangent, (value, success) = self._along(save, given, *y, t)
         return (value, tangent), success
 
-    def outcome(self, given: GivenTangent, moving: Moving) -> tuple[Outcome, Any]:
+    def outcome(self, given: GivenTangent, moving: Moving) -> tuple[LaneOutcome, Any]:
         return given.equations.outcome(given.given, moving.trajectory), moving.tangent.y
 
 
 def tangents_in_lanes(
     inputs: Inputs, differentiated: Any, tangents: Any, limit: int
 ) -> tuple[Any, Any]:
-    """Return the tangents of times and values; `tangents` of the inputs have `None` where there is
-    none; `differentiated`: a tree of truth values."""
+    """Return the tangents of times and values. `tangents` of the inputs are `None` where there are
+    none; `differentiated` is a tree of Booleans."""
     parts, along = Parts.of(inputs, differentiated), Parts.of(tangents, differentiated)
     equations = Tangents(parts, along.common)
     given = parts.each, parts.rest_each, along.each

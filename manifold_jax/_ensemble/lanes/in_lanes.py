@@ -1,4 +1,4 @@
-"""Many trajectories in lanes, with their derivatives."""
+"""Solving many trajectories in lanes, and the derivatives of that."""
 
 import contextlib
 import dataclasses
@@ -21,21 +21,21 @@ from ..._solver.unconstrained import Unconstrained
 from .forward import tangents_in_lanes
 from .mapped import gradient_of_mapped, tangents_of_mapped
 from .parts import in_steps, Inputs, Parts, times_are_differentiated
-from .records import Ends
-from .reverse import ReverseSweep
+from .records import LaneEnds
+from .reverse import LaneReverseSweep
 from .rows import saved_rows, smooth_rows
-from .schedule import Run, Schedule
+from .schedule import LaneRun, Schedule
 from .solution import EnsembleSolution
 
 
-# Numbers that all trajectories have in common, each of which has a sum of its own in every lane.
+# Largest number of differentiated numbers that are common to all; each has a sum in every lane.
 _MOST_IN_COMMON = 200
 
 
 def gradient_in_lanes(
-    inputs: Inputs, differentiated: Any, run: Run, bar: Any, limit: int
+    inputs: Inputs, differentiated: Any, run: LaneRun, bar: Any, limit: int
 ) -> Inputs:
-    """`bar`: cotangents of times and values; `differentiated`: a tree of truth values."""
+    """Return the gradient from `bar`, the cotangents of times and values."""
     parts = Parts.of(inputs, differentiated)
     if sum(x.size for x in jtu.tree_leaves(parts.common)) > _MOST_IN_COMMON:
         raise NotScalarError("too many numbers in common")
@@ -43,16 +43,16 @@ def gradient_in_lanes(
     at = parts.each, parts.common, run.start.trajectory.y, run.outcome.y, smooth
     values, pullback = jax.vjp(saved, *at)
     each, common, *bars = pullback(with_zeros(values, bar))
-    ends = Ends(run.start.trajectory, run.outcome.num_steps, run.rows, run.states, *bars)
-    more = ReverseSweep(parts, ends, limit).run()
+    ends = LaneEnds(run.start.trajectory, run.outcome.num_steps, run.rows, run.states, *bars)
+    more = LaneReverseSweep(parts, ends, limit).run()
     each, common = jtu.tree_map(jnp.add, (each, common), more)
     return common._replace(batch=dataclasses.replace(common.batch, each=each))
 
 
-# Operations on one number, of a start and a step, beyond which trajectories are mapped over instead. A
-# double pendulum has 3389; the 16308 of a four-bar linkage take 72 s to compile, and half of the time.
+# Largest number of scalar operations in a start and a step; beyond it trajectories are mapped. A double
+# pendulum has 3389; the 16308 of a four-bar linkage take 72 s to compile, and half of the time.
 _LONGEST = 8_000
-# Of the reverse sweep, which has the step twice.
+# The same for the reverse sweep, which contains the step twice.
 _LONGEST_BACK = 5 * _LONGEST
 
 
@@ -62,7 +62,7 @@ def solve_in_lanes(inputs: Inputs) -> EnsembleSolution:
     return solution
 
 
-def _run(inputs: Inputs) -> tuple[EnsembleSolution, Run]:
+def _run(inputs: Inputs) -> tuple[EnsembleSolution, LaneRun]:
     equations, batch = inputs
     equations = in_steps(equations)
     run = Schedule(equations, batch.each, batch.complete, _LONGEST).run()
@@ -110,7 +110,7 @@ def _backward(run, cotangents, perturbed, inputs):
 
 
 def _in_lanes_or_mapped(differentiated: Any, in_lanes: Callable, mapped: Callable) -> Any:
-    """`in_lanes()`, or `mapped()` for derivatives of times, and where lanes would take too long."""
+    """Return `in_lanes()`, or `mapped()` for derivatives of times and if lanes would take too long."""
     if not times_are_differentiated(differentiated):
         with contextlib.suppress(NotScalarError):
             return in_lanes()

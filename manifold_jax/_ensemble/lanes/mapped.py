@@ -1,4 +1,4 @@
-"""The ordinary way: `diffeqsolve` for each trajectory, some of them at a time."""
+"""Solving many trajectories with `diffeqsolve` under `jax.lax.map`, in batches."""
 
 from typing import Any
 
@@ -46,8 +46,7 @@ def _times_and_values(inputs: Inputs) -> Any:
 
 
 def gradient_of_mapped(inputs: Inputs, differentiated: Any, bar: Any) -> Any:
-    """Return the gradient from the cotangents of times and values, each trajectory by the reverse
-    sweep of `diffeqsolve`."""
+    """Return the gradient from the cotangents of times and values, by the sweep of `diffeqsolve`."""
     smooth, rest = eqx.partition(inputs, differentiated)
     saved = lambda smooth: _times_and_values(eqx.combine(smooth, rest))
     values, pullback = jax.vjp(saved, smooth)
@@ -55,6 +54,5 @@ def gradient_of_mapped(inputs: Inputs, differentiated: Any, bar: Any) -> Any:
 
 
 def tangents_of_mapped(inputs: Inputs, tangents: Any) -> Any:
-    """Return the tangents of times and values; `tangents` of the inputs have `None` where there is
-    none."""
+    """Return the tangents of times and values; those of the inputs are `None` where there are none."""
     return eqx.filter_jvp(_times_and_values, (inputs,), (tangents,))[1]

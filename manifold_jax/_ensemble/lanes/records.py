@@ -1,4 +1,4 @@
-"""What the reverse sweep of an ensemble begins with, carries along, and keeps of the forward one."""
+"""The data of the reverse sweep of an ensemble."""
 
 from typing import Any, NamedTuple
 
@@ -9,43 +9,46 @@ from .columns import Stacked
 from .trajectory import Trajectory
 
 
-class Ends(NamedTuple):
-    """The ends of all trajectories, in front of every array: the states they begin with, numbers
-    of steps and of saved rows, and the table of states there (see [`Run`][]); cotangents of the
-    first and the last states and of the values at `ts`."""
+class LaneEnds(NamedTuple):
+    """Starts and ends of all `N` trajectories, which are the leading axis of every array."""
 
     start: Trajectory
     num_steps: Array
-    rows: Array
-    states: Stacked | None
-    first_bar: Any
+    rows: Array  # how many of the times to save at each has reached
+    states: Stacked | None  # the states at these times, a table (see [`LaneRun`][])
+    first_bar: Any  # cotangents of the first and the last states, and of the values at `ts`
     last_bar: Any
     values_bar: Any
 
 
 class Group(NamedTuple):
-    """Those that go together: which they are, and whether anything depends on them; what they are
-    given; the cotangents of their states at `ts`, time by time."""
+    """The trajectories that go back together, one in each lane."""
 
-    index: Array
-    present: Array
-    each: Columns
-    rest: Columns
-    at_times: Stacked | None
+    index: Array  # (lanes,)
+    present: Array  # whether there is one, with a cotangent other than zero
+    each: Columns  # its own data that are differentiated
+    rest: Columns  # those that are not
+    at_times: Stacked | None  # cotangents of its states at `ts`, with the times in front
+
+
+class InputBars(NamedTuple):
+    """Cotangents of the differentiated inputs: of each trajectory, and common to all."""
+
+    each: Any
+    common: Any
 
 
 class Bars(NamedTuple):
-    """Cotangents so far, of the state and of what steps depend on; which of the times to save at is
-    the last one still to come."""
+    """The cotangents so far, of the state and of the inputs."""
 
     state: Columns
     each: Columns
     common: Columns
-    row: Array
+    row: Array  # the last of the times to save at that is still to come
 
 
-class Record(NamedTuple):
-    """The steps of a segment: where they begin and end, from which state; which were accepted."""
+class LaneRecord(NamedTuple):
+    """The steps of a segment, which are the leading axis of every array."""
 
-    steps: Stacked
-    accepted: Array
+    steps: Stacked  # their start and end times, and the states before them
+    accepted: Array  # (steps, lanes)

@@ -1,4 +1,4 @@
-"""What was asked for, in the order in which `diffrax.SaveAt` has it."""
+"""The rows of `diffrax.SaveAt`, in its order: the start, given times, the end."""
 
 from collections.abc import Callable
 from typing import Any
@@ -18,8 +18,8 @@ from .parts import Parts
 def saved_rows(
     sub: dfx.SubSaveAt, batch: Batch, rows: Array, t1: Array, first: Y, last: Y, values: Any
 ) -> tuple[Array, Any]:
-    """Times and values, the trajectories in front: at the start, where states are `first`; at given
-    times, of which each has reached the first `rows`; at the end, at `t1`, where they are `last`."""
+    """Return times and values, with the trajectories in front: at the start, where states are `first`;
+    at given times, of which each has reached the first `rows`; at the end `t1`, where they are `last`."""
     saved = lambda t, y, each: sub.fn(t, y, batch.complete(each).args)
     at = lambda t, y: jax.vmap(saved)(t, y, batch.each)
     t0 = jax.vmap(lambda each: batch.complete(each).t0)(batch.each)
@@ -29,7 +29,7 @@ def saved_rows(
         parts.append((t0[:, None], as_row(at(t0, first))))
     if sub.ts is not None:
         ts = jnp.broadcast_to(sub.ts.astype(t0.dtype)[None], (batch.size, sub.ts.size))
-        # Also where the solve is of no length, and makes no step.
+        # The start itself is reached without a step.
         is_first = ts == t0[:, None]
         reached = (jnp.arange(sub.ts.size)[None] < rows[:, None]) | is_first
         values = jtu.tree_map(
@@ -44,8 +44,8 @@ def saved_rows(
 
 
 def smooth_rows(parts: Parts, rows: Array, t1: Array, values: Any) -> tuple[Callable, Any]:
-    """The real numbers of [`saved_rows`][] as a function of `each`, `common`, the first and the last
-    states and the real numbers in `values`; and those."""
+    """Return the real numbers of [`saved_rows`][] as a function of `each`, `common`, the first and the
+    last states and the real numbers in `values`; and the latter."""
     smooth, others = eqx.partition(values, eqx.is_inexact_array)
 
     def saved(each: Any, common: Any, first: Y, last: Y, smooth: Any) -> Any:

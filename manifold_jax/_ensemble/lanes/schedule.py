@@ -11,17 +11,18 @@ from jaxtyping import Array
 
 from ..._jaxpr.lane_arrays import Lanes
 from ..._jaxpr.lane_interpreter import call_in_lanes
-from ..._jaxpr.lane_value import Columns, Layout, Value, where
+from ..._jaxpr.lane_value import ColumnLayout, Columns, LaneValue, where
 from .columns import empty_table, read, Stacked, taken, unknown, written
-from .trajectory import Start
+from .trajectory import LaneStart
 
 
-# Steps between two looks at which lanes have ended. A lane waits half of them on average.
-_STEPS = 8
+# Number of steps between refills of the lanes that have ended. A lane waits half of them on average.
+_STEPS_BETWEEN_REFILLS = 8
 
 
-class Lane(NamedTuple):
-    """All lanes: which trajectory each has, its own data and state, and the next time to save at."""
+class Slots(NamedTuple):
+    """The contents of the lanes: the number of the trajectory in each, its own data and state, and the next
+    time to save at."""
 
     number: Array
     given: Columns
@@ -30,8 +31,8 @@ class Lane(NamedTuple):
 
 
 class Totals(NamedTuple):
-    """What is known of all trajectories: the outcomes so far, how many times to save at were
-    reached, and the table of states there; the next trajectory to take, and how many have ended."""
+    """Results of all trajectories so far: the outcomes, how many times to save at were reached, and the
+    table of states there; the next trajectory to take, and how many have ended."""
 
     outcomes: Columns
     rows: Array
@@ -40,12 +41,13 @@ class Totals(NamedTuple):
     ended: Array
 
 
-class Run(NamedTuple):
-    """All trajectories, in front of every array. How many of the times to save at each has reached; the
-    states there, as they were interpolated (a table, in its rows the times of one trajectory after
-    those of the other), what was returned, and whether some of it could not be corrected."""
+class LaneRun(NamedTuple):
+    """The results of all trajectories, which are the leading axis of every array. `rows`: how many of
+    the times to save at each has reached. `states`: a table of the interpolated states there,
+    trajectory after trajectory, with a row for each time. `values`: their saved values, `failed`:
+    whether any of these could not be corrected."""
 
-    start: Any  # `Start` and `Outcome`, or what the equations have in their place
+    start: Any  # `LaneStart` and `LaneOutcome`, or those of other `equations`
     outcome: Any
     rows: Array
     states: Stacked | None
@@ -54,9 +56,12 @@ class Run(NamedTuple):
 
 
 class Schedule:
-    """`equations` are [`Equations`][], or have their methods; `given` is what each trajectory has of
-    its own, the trajectories in front of every array; `complete` makes of that of one what the
-    methods are given."""
+    """Runs all trajectories.
+
+    - `equations`: [`LaneEquations`][], or an object with the same methods.
+    - `given`: the data that each trajectory has of its own, with the trajectories in front.
+    - `complete`: maps the data of one trajectory to the first argument of these methods.
+    """
 
     def __init__(self, equations: Any, given: Any, complete: Any, limit: int):
         self.equations, self.complete = equations, complete
@@ -66,12 +71,12 @@ class Schedule:
         self.given = Columns.of_arrays(given)
         self.ts = equations.saveat.subs.ts
 
-    def run(self) -> Run:
+    def run(self) -> LaneRun:
         flat = lambda x: x.reshape(-1)[: self.size]
         starts, corrections = jtu.tree_map(flat, self._of_all(self._begin))
         first = jnp.arange(self.count)
         given, state = taken((self.given, starts), first)
-        lane = Lane(first, given, state, jnp.zeros(self.count, int))
+        lane = Slots(first, given, state, jnp.zeros(self.count, int))
         outcome_layout, y_layout = self._layouts(starts.layout)
         empty = [jnp.full(self.size, unknown(d), d) for d in outcome_layout.dtypes_of_columns()]
         totals = Totals(
@@ -82,30 +87,32 @@ class Schedule:
             jnp.asarray(0),
         )
 
-        def advance(carry: tuple[Lane, Totals]) -> tuple[Lane, Totals]:
+        def advance(carry: tuple[Slots, Totals]) -> tuple[Slots, Totals]:
             with self.lanes.inside():
                 lane, totals = carry
                 step = lambda carry, _: (self._step(*carry), None)
-                (lane, states), _ = lax.scan(step, (lane, totals.states), None, length=_STEPS)
+                (lane, states), _ = lax.scan(
+                    step, (lane, totals.states), None, length=_STEPS_BETWEEN_REFILLS
+                )
                 return self._refill(lane, totals._replace(states=states), starts)
 
         _, totals = lax.while_loop(lambda c: c[1].ended < self.size, advance, (lane, totals))
-        start = Start(starts.arrays(), corrections.arrays())
+        start = LaneStart(starts.arrays(), corrections.arrays())
         values, failed = None, jnp.zeros(self.size, bool)
         if totals.states is not None:
             firsts = Columns.of_arrays(self.equations.state_of(start.trajectory))
             values, failed = self._handed_out(totals.rows, totals.states, firsts)
-        return Run(start, totals.outcomes.arrays(), totals.rows, totals.states, values, failed)
+        return LaneRun(start, totals.outcomes.arrays(), totals.rows, totals.states, values, failed)
 
     def _call(self, function: Any, given: Columns, *args: Any) -> Any:
         call = lambda of_each, *args: function(self.complete(of_each), *args)
         return call_in_lanes(self.lanes, call, given.values(), *args)
 
-    def _column(self, value: Value) -> Array:
+    def _column(self, value: LaneValue) -> Array:
         return value.columns(self.lanes)[0]
 
     def _of_all(self, function: Callable) -> Any:
-        """`function(index)` for all trajectories, as many of them at a time as there are lanes."""
+        """Return `function(index)` for all trajectories, as many of them at a time as there are lanes."""
         pieces = -(-self.size // self.count)
         index = jnp.minimum(jnp.arange(pieces * self.count), self.size - 1)
         return lax.map(function, index.reshape(pieces, self.count))
@@ -116,15 +123,15 @@ class Schedule:
             start = self._call(self.equations.begin, given)
             return [Columns.of_values(x, self.lanes) for x in start]
 
-    def _layouts(self, state_layout: Layout) -> tuple[Layout, Layout]:
+    def _layouts(self, state_layout: ColumnLayout) -> tuple[ColumnLayout, ColumnLayout]:
         """Return the layouts of outcomes and of states."""
         given, trajectory = self.given.layout.example(), state_layout.example()
         outcome = lambda given, trajectory: self.equations.outcome(self.complete(given), trajectory)
-        outcomes = Layout.of(jax.eval_shape(outcome, given, trajectory))
-        return outcomes, Layout.of(self.equations.state_of(trajectory))
+        outcomes = ColumnLayout.of(jax.eval_shape(outcome, given, trajectory))
+        return outcomes, ColumnLayout.of(self.equations.state_of(trajectory))
 
     def _handed_out(self, rows: Array, states: Stacked, firsts: Columns) -> tuple[Any, Array]:
-        """What is saved of the states, time by time; lanes go together."""
+        """Return the saved values of the states, time by time, and whether any could not be corrected."""
         times = self.ts.size
 
         def of_lanes(index: Array) -> tuple[Array, Columns]:
@@ -134,7 +141,7 @@ class Schedule:
                 reached = row < num_rows
                 with self.lanes.inside(first.columns[0]):
                     y = where(reached, read(states, index * times + row), first).values()
-                    t = Value.of_column(jnp.broadcast_to(self.ts[row], reached.shape))
+                    t = LaneValue.of_column(jnp.broadcast_to(self.ts[row], reached.shape))
                     value, success = self._call(self.equations.saved_value, given, t, y)
                     failed |= reached & ~self._column(success)
                     return failed, Columns.of_values(value, self.lanes)
@@ -150,7 +157,7 @@ class Schedule:
         values = jtu.tree_map(lambda x: x.reshape(self.size, times, *x.shape[1:]), values)
         return values, failed.ravel()[: self.size]
 
-    def _step(self, lane: Lane, states: Stacked | None) -> tuple[Lane, Stacked | None]:
+    def _step(self, lane: Slots, states: Stacked | None) -> tuple[Slots, Stacked | None]:
         with self.lanes.inside(lane.state.columns[0]):
 
             def attempt(given: Any, trajectory: Any) -> tuple[Any, Any]:
@@ -164,9 +171,11 @@ class Schedule:
                 lane, states = self._save(lane, states, tried, active)
             return lane._replace(state=where(active, after, lane.state)), states
 
-    def _save(self, lane: Lane, states: Stacked, tried: Any, active: Array) -> tuple[Lane, Stacked]:
-        """States at the times in this step. What takes long, their correction, is left for later: here it
-        would be done for all lanes whenever one of them has something to save."""
+    def _save(
+        self, lane: Slots, states: Stacked, tried: Any, active: Array
+    ) -> tuple[Slots, Stacked]:
+        """Save the interpolated states at the times in this step. Their correction is expensive and
+        left for later: here it would be done for all lanes whenever one of them has something to save."""
         kept = active & self._column(tried.kept)
         end, start = self._column(tried.end), self._column(tried.start)
         info = Columns.of_values(tried.dense_info, self.lanes)
@@ -179,7 +188,7 @@ class Schedule:
             row, states = carry
             here = due(row)
             with self.lanes.inside():
-                times = map(Value.of_column, (at(row), start, end))
+                times = map(LaneValue.of_column, (at(row), start, end))
                 interpolated = self.equations.interpolated
                 y = call_in_lanes(self.lanes, interpolated, *times, info.values())
                 y = Columns.of_values(y, self.lanes)
@@ -189,7 +198,7 @@ class Schedule:
         row, states = lax.while_loop(lambda c: jnp.any(due(c[0])), save, (lane.row, states))
         return lane._replace(row=row), states
 
-    def _refill(self, lane: Lane, totals: Totals, starts: Columns) -> tuple[Lane, Totals]:
+    def _refill(self, lane: Slots, totals: Totals, starts: Columns) -> tuple[Slots, Totals]:
         state = lane.state.values()
         goes_on = self._column(self._call(self.equations.goes_on, lane.given, state))
         ended = ~goes_on & (lane.number < self.size)
@@ -203,7 +212,7 @@ class Schedule:
         fresh = ended & (number < self.size)
         following = taken((self.given, starts), jnp.where(fresh, number, 0))
         given, state = where(fresh, following, (lane.given, lane.state))
-        lane = Lane(number, given, state, jnp.where(fresh, 0, lane.row))
+        lane = Slots(number, given, state, jnp.where(fresh, 0, lane.row))
         count = jnp.sum(ended)
         return lane, Totals(
             outcomes, rows, totals.states, totals.next + count, totals.ended + count

@@ -1,4 +1,4 @@
-"""What an ensemble returns."""
+"""The solution of an ensemble."""
 
 from typing import Any
 
@@ -24,14 +24,14 @@ from ..._solve.outcome import (
 class EnsembleSolution(eqx.Module):
     """The solutions of `N` trajectories, in the order of the initial values.
 
-    - `ts`: the times of what was saved, `(N, T)`; infinite where a trajectory did not get there, and with
+    - `ts`: the times of saved values, `(N, T)`; infinite where a trajectory did not get there, and with
       `SaveAt(t1=True)` the time at which it stopped: see `failed`.
     - `ys`: the saved values, `(N, T, ...)`.
     - `stats`: as of [`diffeqsolve`][] without `max_steps`, each of shape `(N,)`.
     - `result`: the result codes of all trajectories.
     - `execution`: "in lanes", or why not.
-    - `messages`: what the result codes mean, by number; the last three say of a trajectory without
-        steps that its times or its start could not be used.
+    - `messages`: those of the result codes, by number; the last three are for a trajectory without
+        steps whose times or start could not be used.
     """
 
     ts: PyTree[Array]
@@ -43,11 +43,11 @@ class EnsembleSolution(eqx.Module):
 
     @property
     def failed(self) -> Array:
-        """Which trajectories did not get to their end, shape `(N,)`."""
+        """Whether each trajectory failed to reach its end, shape `(N,)`."""
         return ~jax.vmap(is_okay)(self.result)
 
     def reasons(self) -> Array:
-        """Numbers of `messages`, shape `(N,)`, 0 where a trajectory is successful."""
+        """Return numbers of `messages`, shape `(N,)`, 0 where a trajectory is successful."""
         codes = number_of_result(self.result)
         num_steps, last = self.stats["num_steps"], len(self.messages) - 1
         # A start that is not finite cannot be moved by a finite distance.
@@ -58,8 +58,8 @@ class EnsembleSolution(eqx.Module):
         return jnp.where(self.failed, codes, 0)
 
     def failures(self, most: int = 10) -> list[tuple[int, str]]:
-        """Numbers and reasons of the first that failed; not under `jit`. Of several processes each
-        lists those of its own devices."""
+        """Return indices and reasons of the first that failed; not under `jit`. Each of several
+        processes lists those of its own devices."""
         reasons, failed = jnp.asarray(self.reasons()), {}
         for shard in reasons.addressable_shards:
             part = np.asarray(shard.data)
@@ -69,5 +69,5 @@ class EnsembleSolution(eqx.Module):
 
 
 def messages_of(solver: dfx.AbstractSolver) -> tuple[str, ...]:
-    """What `EnsembleSolution.reasons` are numbers of."""
+    """Return the messages for the numbers of `EnsembleSolution.reasons`."""
     return (*messages_for(solver), NO_TIME, NOT_FINITE_START, UNUSABLE_START)

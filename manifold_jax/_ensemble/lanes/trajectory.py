@@ -1,7 +1,7 @@
-"""One trajectory as functions of arrays: how it begins, one attempted step, a value inside it.
+"""One trajectory as functions of arrays: its start, one attempted step, a value inside it.
 
-What `diffrax.diffeqsolve` does in its loop, through the public methods of solvers and controllers, so
-that many of them can be advanced by a loop of another kind.
+The loop of `diffrax.diffeqsolve`, taken apart through the public methods of solvers and controllers, so
+that another loop can advance many trajectories.
 """
 
 from typing import Any, NamedTuple
@@ -20,11 +20,11 @@ from ..._base.types import Args, BoolScalar, FloatScalar, IntScalar, RealScalarL
 from ..._solve.prepare import prepare
 from ..._solve.setup import Consistent, ProblemData, Setup
 from ..._solve.times import is_time_missing
-from ..._solver.step.advance import HookState, StepStatistics
+from ..._solver.step.hook_state import HookState, StepStatistics
 
 
 class Trajectory(NamedTuple):
-    """Between two steps, with times that increase."""
+    """The state of a trajectory between two steps, with times that increase."""
 
     tprev: FloatScalar
     tnext: FloatScalar
@@ -36,8 +36,8 @@ class Trajectory(NamedTuple):
     num_accepted: IntScalar
 
 
-class Given(NamedTuple):
-    """What a trajectory is defined by, besides what all have in common."""
+class TrajectoryData(NamedTuple):
+    """The data that define a trajectory, besides those that all have in common."""
 
     t0: FloatScalar
     t1: FloatScalar
@@ -50,13 +50,13 @@ class Given(NamedTuple):
         return jnp.where(self.t0 < self.t1, 1, -1).astype(self.t0.dtype)
 
 
-class Start(NamedTuple):
+class LaneStart(NamedTuple):
     trajectory: Trajectory
     correction: FloatScalar
 
 
 class Attempt(NamedTuple):
-    """What a step led to; whether it was kept, where it ended if so, and its interpolation."""
+    """The result of a step: the trajectory after it, whether it was kept, and its interpolation."""
 
     trajectory: Trajectory
     kept: BoolScalar
@@ -65,8 +65,8 @@ class Attempt(NamedTuple):
     dense_info: Any
 
 
-class Outcome(NamedTuple):
-    """The outcome of a trajectory that has ended."""
+class LaneOutcome(NamedTuple):
+    """The end of a trajectory."""
 
     t: FloatScalar
     y: Y
@@ -76,11 +76,11 @@ class Outcome(NamedTuple):
     statistics: StepStatistics
 
 
-class Equations(eqx.Module):
-    """What all trajectories have in common."""
+class LaneEquations(eqx.Module):
+    """The settings that all trajectories have in common."""
 
     terms: dfx.AbstractTerm
-    solver: Any  # for lanes one of this library, else any of Diffrax
+    solver: Any  # in lanes one of this library, else any of Diffrax
     controller: dfx.AbstractStepSizeController
     saveat: dfx.SaveAt
     dt0: RealScalarLike | None
@@ -89,7 +89,7 @@ class Equations(eqx.Module):
     lanes: int = eqx.field(static=True)  # how many trajectories advance together
     consistent: Consistent = eqx.field(static=True)
 
-    def begin(self, given: Given) -> Start:
+    def begin(self, given: TrajectoryData) -> LaneStart:
         solver, args = self.solver, given.args
         settings = self.dt0, self.saveat, self.controller, self.consistent
         data = ProblemData(given.t0, given.t1, given.y0, args)
@@ -113,13 +113,13 @@ class Equations(eqx.Module):
         result = RESULTS.where(missing, RESULTS.nonfinite_input, result)  # pyright: ignore[reportArgumentType]
         zero = jnp.zeros((), jnp.int32)
         trajectory = Trajectory(t0, tnext, y0, solver_state, controller_state, result, zero, zero)
-        return Start(trajectory, ready.start.correction)
+        return LaneStart(trajectory, ready.start.correction)
 
-    def goes_on(self, given: Given, trajectory: Trajectory) -> BoolScalar:
+    def goes_on(self, given: TrajectoryData, trajectory: Trajectory) -> BoolScalar:
         before = trajectory.tprev < given.t1 * given.direction
         return before & is_okay(trajectory.result) & (trajectory.num_steps < self.max_steps)
 
-    def attempt(self, given: Given, trajectory: Trajectory) -> Attempt:
+    def attempt(self, given: TrajectoryData, trajectory: Trajectory) -> Attempt:
         solver, direction = self.solver, given.direction
         terms, t1 = directed(self.terms, direction), given.t1 * direction
         before, end = trajectory, trajectory.tnext
@@ -133,7 +133,7 @@ class Equations(eqx.Module):
         )
         kept = jnp.asarray(kept)
         tprev = jnp.minimum(tprev, t1)
-        # A step that ends just short of the end would leave one of a few rounding errors.
+        # A step that ends just before the end would leave one of a few rounding errors.
         last = jnp.where(kept, t1, tprev + 0.5 * (t1 - tprev))
         tnext = jnp.where(tnext > given.end_floor, last, tnext)
         keep = lambda a, b: jnp.where(kept, a, b)
@@ -156,11 +156,11 @@ class Equations(eqx.Module):
     def interpolated(
         self, t: FloatScalar, start: FloatScalar, end: FloatScalar, dense_info: Any
     ) -> Y:
-        """The state inside a step, as the solver interpolates it. Times increase."""
+        """Return the state inside a step, as the solver interpolates it. Times increase."""
         return self.solver.interpolation_cls(t0=start, t1=end, **dense_info).evaluate(t)
 
-    def saved_value(self, given: Given, t: FloatScalar, y: Y) -> tuple[Any, BoolScalar]:
-        """What is saved of such a state, and whether it is on the manifold. `t` is the true time."""
+    def saved_value(self, given: TrajectoryData, t: FloatScalar, y: Y) -> tuple[Any, BoolScalar]:
+        """Return the saved value of such a state, and whether it is on the manifold, at the true time."""
         success = jnp.asarray(True)
         if self.solver.corrects_output:
             y, info = self.solver.correct(t, y, given.args)
@@ -168,21 +168,21 @@ class Equations(eqx.Module):
             y = jtu.tree_map(lambda leaf: jnp.where(success, leaf, jnp.nan), y)
         return self.saveat.subs.fn(t, y, given.args), success
 
-    def outcome(self, given: Given, trajectory: Trajectory) -> Outcome:
+    def outcome(self, given: TrajectoryData, trajectory: Trajectory) -> LaneOutcome:
         result = trajectory.result
         unfinished = (trajectory.tprev < given.t1 * given.direction) & is_okay(result)
         result = RESULTS.where(unfinished, RESULTS.max_steps_reached, result)
         result = update_result(result, trajectory.solver_state.result)
         t = trajectory.tprev * given.direction
         counts = trajectory.num_steps, trajectory.num_accepted
-        return Outcome(t, trajectory.y, result, *counts, trajectory.solver_state.statistics)
+        return LaneOutcome(t, trajectory.y, result, *counts, trajectory.solver_state.statistics)
 
 
 def end_floor(t0: Array, t1: Array) -> Array:
-    """The hundredth number below `t1`, where time increases: steps that would end beyond it end at
-    `t1`, as in `diffrax.diffeqsolve`. Numbers are counted as the integers of their bits."""
+    """Return the hundredth floating-point number before `t1`, in increasing time: steps that would end
+    after it end at `t1`, as in `diffrax.diffeqsolve`. Counted in the integers of their bits."""
     end = lax.stop_gradient(jnp.where(t0 < t1, t1, -t1))
-    tiny = jnp.finfo(end.dtype).tiny  # smaller numbers are zero to XLA
+    tiny = jnp.finfo(end.dtype).tiny  # XLA flushes smaller numbers to zero
     first = jnp.where(end == 0, -tiny, jnp.nextafter(end, -jnp.inf))
     bits = lax.bitcast_convert_type(first, f"int{8 * end.dtype.itemsize}")
     bits = jnp.where(first > 0, bits - 99, bits + 99)

@@ -1,4 +1,4 @@
-"""What a stored ensemble consists of on the disk, and how it is written."""
+"""The files of a stored ensemble, and how they are written."""
 
 import contextlib
 import hashlib
@@ -12,14 +12,14 @@ import jax.tree_util as jtu
 import numpy as np
 
 
-# Marks in `result` the trajectories that are not there yet.
+# Marks trajectories in `result` that have not been computed.
 _MISSING = -1
 # Files that were being written when the process was killed.
 _PARTIAL = re.compile(r"[^.]*\.[0-9a-f]{32}\.partial")
 
 
 def zarr() -> Any:
-    """The package, which is not needed for anything else."""
+    """Return the package zarr, which only stored ensembles need."""
     try:
         import zarr
     except ImportError as error:
@@ -33,8 +33,8 @@ def zarr() -> Any:
 def create_group(
     path: Path, settings: dict[str, Any], messages: Sequence[str], examples: Any
 ) -> Any:
-    """Its description comes first, so that whatever a folder has belongs to one: settings, and
-    fingerprints of the files `zarr.json` that follow and of itself."""
+    """Create the group. Its description is written first, so that all other files in a folder belong to
+    one: settings, and fingerprints of the files `zarr.json` that follow and of itself."""
     files: dict[str, Any] = {}
     planned = zarr().create_group(zarr().storage.MemoryStore(files))
     create_arrays(planned, settings["size"], settings["chunk"], examples)
@@ -50,8 +50,8 @@ def create_group(
 
 
 def create_arrays(group: Any, size: int, chunk: int, examples: Any) -> None:
-    """Those that are not there, of one chunk as [`write`][] is given it. Each chunk of each array is
-    one file, which ends with its checksum."""
+    """Create the arrays that are missing, for chunks as [`write`][] gets them. Each chunk of each array
+    is one file, which ends with its checksum."""
     codecs = zarr().codecs
     for name, x in named(examples):
         for end in (at for at, letter in enumerate(name) if letter == "/"):
@@ -69,17 +69,17 @@ def create_arrays(group: Any, size: int, chunk: int, examples: Any) -> None:
 
 
 def write(group: Any, start: int, values: Any) -> None:
-    """One chunk. Each file is there as a whole or not at all; that of `result` comes last."""
+    """Write one chunk. Each file is there as a whole or not at all; that of `result` comes last."""
     with clear_write_errors(group.store.root):
         for name, x in named(values):
-            # Numbers that are all zero are written, too: a file that is not there is one that was lost.
+            # Chunks of zeros are written, too: a file that is missing is one that was lost.
             array = group[name].with_config({"write_empty_chunks": True})
             stop = min(start + x.shape[0], array.shape[0])
             array[start:stop] = np.asarray(x)[: stop - start]
 
 
 def named(values: Any) -> list[tuple[str, Any]]:
-    """Leaves of a dictionary of trees with the names of their arrays, that of `result` last."""
+    """Return the leaves of a dictionary of trees with the names of their arrays, that of `result` last."""
     leaves = jtu.tree_flatten_with_path(values)[0]
     out = [(jtu.keystr(path, simple=True, separator="/"), x) for path, x in leaves]
     names = sorted(name for name, _ in out)
@@ -93,19 +93,18 @@ def named(values: Any) -> list[tuple[str, Any]]:
 
 
 def fingerprint_of_attributes(attributes: dict[str, Any]) -> str:
-    """Return a fingerprint of what this library has written there; others may add to it."""
+    """Return a fingerprint of the attributes that this library has written; others may add to them."""
     return _fingerprint([attributes.get(name) for name in ("settings", "messages", "files")])
 
 
 def fingerprint_of_description(description: dict[str, Any]) -> str:
-    """Return a fingerprint of a file `zarr.json`, but for the attributes, which are free for
-    others."""
+    """Return a fingerprint of a file `zarr.json` without its attributes, which are free for others."""
     added = ("attributes", "consolidated_metadata")
     return _fingerprint({name: x for name, x in description.items() if name not in added})
 
 
-def _fingerprint(words: Any) -> str:
-    return hashlib.sha256(json.dumps(words, sort_keys=True).encode()).hexdigest()
+def _fingerprint(values: Any) -> str:
+    return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()
 
 
 def is_partial(file: Path) -> bool:
@@ -126,7 +125,7 @@ def _fill_value(name: str, dtype: Any) -> Any:
 
 @contextlib.contextmanager
 def clear_write_errors(path: Path) -> Iterator[None]:
-    """A full disk, a folder that may not be written to: what to do."""
+    """Convert errors of a full disk or a folder without permission into messages with advice."""
     try:
         yield
     except OSError as error:

@@ -1,4 +1,4 @@
-"""What is missing or damaged of a stored ensemble."""
+"""Missing and damaged files of a stored ensemble."""
 
 import json
 from pathlib import Path
@@ -7,13 +7,12 @@ from typing import Any, NamedTuple
 from .arrays import fingerprint_of_attributes, fingerprint_of_description, zarr
 
 
-# Of so many files a message says what is wrong.
+# Largest number of files that a message lists.
 _MOST = 5
 
 
 class Fault(NamedTuple):
-    """A fault of one file: its name in the folder, what is wrong, and the number of the chunk it
-    has, `None` for a description."""
+    """A fault of one file: its name, what is wrong, the number of its chunk (None for a description)."""
 
     file: str
     what: str
@@ -24,7 +23,7 @@ class Fault(NamedTuple):
 
 
 def described(path: Path) -> dict[str, Any] | None:
-    """The attributes of an ensemble, `None` if there is none in the folder."""
+    """Return the attributes of an ensemble, `None` if there is none in the folder."""
     description, fault = _read(path, "zarr.json")
     if fault is not None and fault.what == "missing":
         return None
@@ -42,8 +41,8 @@ def described(path: Path) -> dict[str, Any] | None:
 
 
 def faults_of_descriptions(path: Path, attributes: dict[str, Any]) -> list[Fault]:
-    """Return the faults of the files `zarr.json` of groups and arrays, without which theirs cannot
-    be read. Before the first chunk they are still being written."""
+    """Return the faults of the files `zarr.json` of groups and arrays, which are needed to read them.
+    Before the first chunk they are still being written."""
     out = []
     for name, fingerprint in attributes["files"].items():
         description, fault = _read(path, name)
@@ -56,8 +55,8 @@ def faults_of_descriptions(path: Path, attributes: dict[str, Any]) -> list[Fault
 
 
 def faults_of_chunks(group: Any) -> list[Fault]:
-    """Return the faults of those chunks that have been computed, each of which is read. The last
-    may be unfinished: `result` is its last array."""
+    """Return the faults of the chunks that have been computed, reading each. The last may be
+    unfinished: `result` is its last array."""
     root, arrays = group.store.root, _arrays(group)
     there = {name: _chunks_there(root, name, array) for name, array in arrays.items()}
     begun = max((max(chunks, default=-1) for chunks in there.values()), default=-1)
@@ -74,7 +73,7 @@ def faults_of_chunks(group: Any) -> list[Fault]:
 
 
 def finished_chunks(group: Any) -> list[int]:
-    """Numbers of the chunks that have a `result`, which is the last array of each."""
+    """Return the numbers of the chunks that have a `result`, which is the last array of each."""
     if "result" not in group:
         return []
     return sorted(_chunks_there(group.store.root, "result", group["result"]))
@@ -92,13 +91,13 @@ def in_words(faults: list[Fault], chunk: int) -> str:
 
 
 def _read(path: Path, name: str) -> tuple[dict[str, Any] | None, Fault | None]:
-    """A file of JSON, or what is wrong with it."""
+    """Return the contents of a JSON file, or its fault."""
     file = path / name
     try:
         description = json.loads(file.read_text(encoding="utf-8"))
     except (FileNotFoundError, NotADirectoryError):
         return None, Fault(name, "missing")
-    except ValueError:  # no text, or no JSON
+    except ValueError:  # not text, or not JSON
         return None, Fault(name, "damaged" if file.stat().st_size else "empty")
     if not isinstance(description, dict):
         return None, Fault(name, "damaged")
@@ -110,7 +109,7 @@ def _has_chunks(path: Path) -> bool:
 
 
 def _arrays(group: Any) -> dict[str, Any]:
-    """All that have numbers, by name."""
+    """Return the arrays that have numbers in their chunks, by name."""
     names = [name.removesuffix("/zarr.json") for name in group.attrs["files"]]
     nodes = {name: group[name] for name in names if name in group}
     return {name: x for name, x in nodes.items() if isinstance(x, zarr().Array) and x.size}
@@ -124,12 +123,12 @@ def _chunks_there(root: Path, name: str, array: Any) -> set[int]:
 
 
 def _file_of(name: str, array: Any, k: int) -> str:
-    """A chunk is a part of the leading axis."""
+    """Return the file of a chunk, a part of the leading axis."""
     return "/".join([name, "c", str(k), *["0"] * (array.ndim - 1)])
 
 
 def _is_readable(array: Any, k: int) -> bool:
-    """Whether the checksum of a chunk is its own."""
+    """Whether the checksum of a chunk is correct."""
     length = array.chunks[0]
     try:
         array[k * length : (k + 1) * length]

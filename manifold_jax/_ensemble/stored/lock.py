@@ -1,4 +1,4 @@
-"""One writer of a folder at a time."""
+"""A lock that allows one writer of a folder at a time."""
 
 import contextlib
 import os
@@ -11,14 +11,14 @@ from typing import IO
 from .arrays import clear_write_errors
 
 
-# Only there while a process writes, or if it was killed: the system gives its lock free then.
+# There while a process writes, or after it was killed: then the system has released its lock.
 LOCK_FILE = "writer.lock"
 
 if sys.platform == "win32":
     import msvcrt
 
     def _try_to_lock(file: IO) -> None:
-        # Of a byte far behind the text, which others may go on reading.
+        # Lock a byte far beyond the text, which others can then still read.
         file.seek(2**30)
         msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)
         file.seek(0)
@@ -32,10 +32,10 @@ else:
 
 @contextlib.contextmanager
 def only_writer(out: Path) -> Iterator[None]:
-    """Hold the lock of the folder, or refuse because somebody else does.
+    """Hold the lock of the folder, or refuse because another process does.
 
-    It belongs to the open file, not to its being there, so that a process that was killed leaves
-    nothing that blocks. Where the file system has no locks there is none.
+    The lock belongs to the open file, not to its existence, so that a process that was killed leaves
+    nothing that blocks. If the file system has no locks there is none.
     """
     path = out / LOCK_FILE
     file = _locked(path, out)
@@ -69,7 +69,7 @@ def _locked(path: Path, out: Path) -> IO:
 
 
 def _is_still_there(path: Path, file: IO) -> bool:
-    """Not where the one who held the lock has removed the file since it was opened."""
+    """Whether the file has not been removed by its holder since it was opened."""
     try:
         return os.path.samestat(os.fstat(file.fileno()), path.stat())
     except FileNotFoundError:

@@ -1,4 +1,4 @@
-"""Ensembles on the disk: arrays in a folder, in the format Zarr."""
+"""Ensembles on disk: arrays in a folder, in the format Zarr."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -26,9 +26,9 @@ class StoredEnsemble:
 
     - `group`: the folder as a `zarr.Group`, of the arrays below.
     - `ts`, `ys`, `stats`: as of [`EnsembleSolution`][], `zarr.Array`s or groups of them.
-    - `result`: numbers of what happened, 0 where all is well, -1 for what has not been computed yet;
-        `messages` says what they mean.
-    - `settings`: what it was computed with.
+    - `result`: result codes, 0 for success, -1 for trajectories that have not been computed yet;
+        `messages` has their meaning.
+    - `settings`: the settings of the run.
     - `faults()`: which of its files are missing or damaged.
     - `size`, `chunk`, `finished`: how many trajectories it has at its end, in one piece, and by now.
     - `num_failed`: how many of those that are finished failed.
@@ -60,12 +60,12 @@ class StoredEnsemble:
 
     @property
     def finished(self) -> int:
-        """Chunks are written one after the other, `result` as the last array of each."""
+        """The number of trajectories computed so far; `result` is the last array of a chunk."""
         ends = ((k + 1) * self.chunk for k in finished_chunks(self.group))
         return sum(self.chunk - max(0, end - self.size) for end in ends)
 
     def faults(self) -> list[Fault]:
-        """Which files are missing or damaged; reads all of them. `str` of each says so."""
+        """Return the files that are missing or damaged, reading all; `str` of a fault describes it."""
         path = Path(self.group.store.root)
         return faults_of_descriptions(path, dict(self.group.attrs)) or faults_of_chunks(self.group)
 
@@ -74,7 +74,7 @@ class StoredEnsemble:
         return sum(int(np.count_nonzero(codes)) for _, codes in self._codes())
 
     def failures(self, most: int = 10) -> list[tuple[int, str]]:
-        """Numbers and reasons of the first that failed, as of [`EnsembleSolution`][]."""
+        """Return indices and reasons of the first that failed, as [`EnsembleSolution`][] does."""
         out: list[tuple[int, str]] = []
         for start, codes in self._codes():
             for i in np.flatnonzero(codes)[: most - len(out)]:
@@ -84,7 +84,7 @@ class StoredEnsemble:
         return out
 
     def failures_by_reason(self, most: int = 3) -> dict[str, tuple[int, list[int]]]:
-        """Return for each reason how many failed, and the numbers of the first."""
+        """Return for each reason how many failed, and the indices of the first."""
         counts: dict[int, int] = {}
         first: dict[int, list[int]] = {}
         for start, codes in self._codes():
@@ -112,7 +112,7 @@ def open_ensemble(path: str | Path, *, check: bool = True) -> StoredEnsemble:
     - `path`: its folder. Without this library, `zarr.open_group(path)` opens the same.
     - `check`: read all of its files once, and refuse if some are missing or damaged. Otherwise nothing
         but its description is read: a chunk that is missing reads as NaN (as -1 in `result`),
-        one that is damaged is an error of zarr's, and `faults()` of what is returned lists them.
+        one that is damaged is an error of zarr's, and `faults()` of the result lists them.
 
     **Returns:**
 
@@ -135,7 +135,7 @@ def open_ensemble(path: str | Path, *, check: bool = True) -> StoredEnsemble:
 
 
 def stored_at(path: Path, mode: str = "r") -> StoredEnsemble | None:
-    """`None` if there is none."""
+    """Open an ensemble without checks; `None` if there is none."""
     package = zarr()
     if described(path) is None:
         return None

@@ -1,5 +1,5 @@
-"""Jacobians of many rows at linear cost: which entries there are, products without the matrix, and
-the elimination of block tridiagonal matrices."""
+"""Jacobians of many rows at linear cost: their sparsity, products without the matrix, and the
+elimination of block tridiagonal matrices."""
 
 from .rows import SparseRows as SparseRows
 from .structure import (

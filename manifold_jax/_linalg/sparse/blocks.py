@@ -1,4 +1,4 @@
-"""Small matrices, many at once: products, and factors to divide by one."""
+"""Batches of small matrices: products and factors."""
 
 from typing import NamedTuple
 
@@ -7,17 +7,17 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 
-# Rows up to which products are written out, as in `_linear`.
+# Largest number of rows for which products are written out.
 _WRITTEN_OUT = 4
 
 
 class Pivot(NamedTuple):
     """`A^-1 = right left`, the inverses of the triangular factors of `A = L U`.
 
-    Not their product: an elimination that divides by `A^-1` loses twice the digits that the
-    condition of the blocks explains, one that uses triangular factors none of them (Demmel, Higham
-    & Schreiber, Numer. Linear Algebra Appl. 2 (1995) 173-190). Without pivoting; not finite, or
-    without meaning, for singular matrices.
+    Their product is not formed: an elimination that multiplies by `A^-1` loses twice the digits that
+    the condition of the blocks explains, one with triangular factors none of them (Demmel, Higham &
+    Schreiber, Numer. Linear Algebra Appl. 2 (1995) 173-190). Without pivoting; not finite, or without
+    meaning, for singular matrices.
     """
 
     left: Float[Array, "*b w w"]  # L^-1, with a unit diagonal
@@ -25,8 +25,7 @@ class Pivot(NamedTuple):
 
     @staticmethod
     def of(A: Float[Array, "*b w w"]) -> "Pivot":
-        """Invert a block in the place of `A`, as Gauss-Jordan elimination, which also forms the
-        product."""
+        """Invert a block in place, by Gauss-Jordan elimination without the steps that form the product."""
         width = A.shape[-1]
         if width <= _WRITTEN_OUT:
             return _entry_by_entry(A)
@@ -51,7 +50,7 @@ class Pivot(NamedTuple):
 
 
 def _entry_by_entry(A: Float[Array, "*b w w"]) -> Pivot:
-    """The same, so that it fuses: half the time of what is masked."""
+    """Do the same entry by entry, so that it fuses: half the time of masked operations."""
     numbers = range(A.shape[-1])
     one, zero = jnp.ones_like(A[..., 0, 0]), jnp.zeros_like(A[..., 0, 0])
     P = [[A[..., i, j] for j in numbers] for i in numbers]

@@ -1,10 +1,10 @@
 r"""Block tridiagonal systems `L_b x_{b-1} + D_b x_b + U_b x_{b+1} = r_b` in linear time.
 
-Blocks are grouped into chunks of neighbours, which are eliminated all at once but for the last block
-of each; those are coupled by a smaller system of the same form (Wang, ACM Trans. Math. Softw. 7
-(1981) 170-183). One loop over all blocks would take as many iterations as there are blocks, of which
-each costs more than its arithmetic. Without pivoting: the matrices met here are close to symmetric
-positive definite, for which any order is stable.
+Blocks are grouped into chunks of neighbours. All chunks are eliminated at the same time, except for
+the last block of each; these are coupled by a smaller system of the same form (Wang, ACM Trans. Math.
+Softw. 7 (1981) 170-183). One loop over all blocks would take as many iterations as there are blocks,
+and an iteration costs more than its arithmetic. Without pivoting: the matrices met here are close to
+symmetric positive definite, for which any order is stable.
 """
 
 from typing import NamedTuple
@@ -17,14 +17,14 @@ from jaxtyping import Array, Float
 from .blocks import apply, Pivot, times
 
 
-# Blocks in a chunk, and up to which number of blocks there is one loop over all of them.
+# Number of blocks in a chunk, and the largest number of blocks that are eliminated in one loop.
 _CHUNK = 32
 _ONE_LOOP = 64
 
 
 class Blocks(NamedTuple):
-    """The blocks of a block tridiagonal matrix, `lower[b]` beside `diagonal[b]` to the left of it,
-    `upper[b]` to the right. The first lower and the last upper one are zero."""
+    """The blocks of a block tridiagonal matrix: `lower[b]` to the left of `diagonal[b]`, `upper[b]` to
+    the right. The first lower and the last upper one are zero."""
 
     lower: Float[Array, "b w w"]
     diagonal: Float[Array, "b w w"]
@@ -36,7 +36,7 @@ class Blocks(NamedTuple):
 
 
 def eliminate(blocks: Blocks) -> "Tridiagonal | InOneLoop | InChunks":
-    """The blocks factored, to be solved with right-hand sides of shape `(b, w)`."""
+    """Factor the matrix, to be solved with right-hand sides of shape `(b, w)`."""
     number, width, _ = blocks.diagonal.shape
     if width == 1:
         return Tridiagonal(blocks)
@@ -54,8 +54,12 @@ class Tridiagonal(eqx.Module):
 
 
 class InOneLoop(eqx.Module):
-    """One block after the other, `x_b = R_b (y_b - W_b x_{b+1})`, `y_b = S_b (r_b - M_b y_{b-1})` with
-    `R_b S_b` the inverse of what is left of `D_b`. Held as `S M` and `R W`, one product for each."""
+    """Elimination of one block after the other: with `R_b S_b` the inverse of the pivot `P_b`,
+
+        M_b = L_b R_{b-1},    P_b = D_b - M_b W_{b-1},    W_b = S_b U_b,
+        y_b = S_b (r_b - M_b y_{b-1}),    x_b = R_b (y_b - W_b x_{b+1}).
+
+    `lower` holds `S_b M_b` and `upper` holds `R_b W_b`, so that each takes one product."""
 
     pivots: Pivot
     lower: Float[Array, "b w w"]
@@ -77,10 +81,9 @@ class InOneLoop(eqx.Module):
 
 
 class InChunks(eqx.Module):
-    """`c` chunks of `1 + k` blocks. The `k` inner ones are `x = g - before s_{c-1} - after s_c` with the
-    last ones, `s`, of their own chunk and of the one before, and `g` linear in `r`."""
+    """Elimination of `c` chunks of `k + 1` blocks, all at the same time. See `of`."""
 
-    pivots: Pivot  # of the inner ones, as `lower` and `upper` in one loop
+    pivots: Pivot  # of the inner blocks; `lower` and `upper` as in `InOneLoop`
     lower: Float[Array, "k c w w"]
     upper: Float[Array, "k c w w"]
     before: Float[Array, "k c w w"]
@@ -91,6 +94,21 @@ class InChunks(eqx.Module):
 
     @staticmethod
     def of(blocks: Blocks) -> "InChunks":
+        """Eliminate the inner blocks `x_1, ..., x_k` of each chunk. They lie between its last block `s`
+        and that of the chunk before, `s'`; forwards, with `M_j`, `P_j` and `W_j` as in `InOneLoop`,
+
+            F_1 = S_1 L_1,    F_j = -S_j M_j F_{j-1},    x_j = R_j (y_j - W_j x_{j+1} - F_j s'),
+
+        and backwards, from `x_{k+1} = s`, hence `g = 0`, `B = 0` and `A = -1` there,
+
+            x_j = g_j - B_j s' - A_j s,
+            g_j = R_j (y_j - W_j g_{j+1}),    B_j = R_j (F_j - W_j B_{j+1}),    A_j = -R_j W_j A_{j+1}.
+
+        The remaining rows `L x_k + D s + U x_1 = r` of the last blocks, with `x_1`, `g_1`, `B_1` and
+        `A_1` of the chunk after and `M = L R_k`, are a system of the same form for `s`:
+
+            -M F_k s' + (D - M W_k - U B_1) s - U A_1 s'' = r - M y_k - U g_1.
+        """
         _, width, _ = blocks.diagonal.shape
         eye = jnp.eye(width, dtype=blocks.diagonal.dtype)
         L, D, U = (
@@ -98,7 +116,6 @@ class InChunks(eqx.Module):
         )
 
         def inwards(before, block):
-            """Forwards; `fill` is what couples a block to the last one of the chunk before."""
             *before, fill = before
             pivot, multiplier, upper = _next_pivot(*before, *block)
             fill = -times(pivot.left, times(multiplier, fill))
@@ -117,8 +134,8 @@ class InChunks(eqx.Module):
         lower = times(pivots.left, lower)
         uppers, fills = times(pivots.right, uppers), times(pivots.right, fills)
 
-        def outwards(behind, block):
-            (before, after), (upper, fill) = behind, block
+        def outwards(following, block):
+            (before, after), (upper, fill) = following, block
             both = fill - times(upper, before), -times(upper, after)
             return both, both
 
@@ -140,14 +157,15 @@ class InChunks(eqx.Module):
 
 
 def _next_pivot(right, upper, L, D, U):
-    """Of a block `L, D, U`, its multiplier and `upper`, from those before."""
+    """Return the pivot of the block row `L, D, U`, its multiplier `M` and `W`, from `R` and `W` of the
+    row before (see `InOneLoop`)."""
     multiplier = times(L, right)
     pivot = Pivot.of(D - times(multiplier, upper))
     return pivot, multiplier, times(pivot.left, U)
 
 
 def _chunks(A: Float[Array, "b ..."], fill: Float[Array, "..."]) -> Float[Array, "k c ..."]:
-    """Position in the chunk first; the chunks next to each other."""
+    """Group the blocks, with the position in a chunk in front; `fill` completes the last chunk."""
     number = A.shape[0]
     count = -(-number // _CHUNK)
     missing = jnp.broadcast_to(fill, (count * _CHUNK - number, *A.shape[1:]))

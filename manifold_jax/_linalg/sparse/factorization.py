@@ -1,4 +1,4 @@
-"""`G V` of sparse rows, formed from products, and factored."""
+"""The matrix `G V` of sparse rows, formed from products and factored."""
 
 import dataclasses
 from typing import Any
@@ -16,19 +16,19 @@ from .structure import Structure
 
 
 class BlockFactorization(eqx.Module):
-    """A factorization with a flag that says whether a system with a known solution is solved to
-    some digits: not if the rank is not full, nor if an entry is missing in the structure.
+    """A factorization that is usable if a system with a known solution is solved to some digits: not if
+    the rank is not full, nor if an entry is missing in the structure.
 
-    The derivative is that of `G V x = b`, whatever the elimination does.
+    The derivative is that of `G V x = b`, not of the elimination.
     """
 
     rows: AbstractRows
     directions: AbstractRows
-    blocks: Blocks  # held fixed, as all that follows
+    blocks: Blocks  # held fixed, as are the fields below
     eliminated: Any
     structure: Structure = eqx.field(static=True)
     symmetric: bool = eqx.field(static=True)
-    full_rank: BoolScalar
+    usable: BoolScalar
 
     @staticmethod
     def of(
@@ -42,7 +42,7 @@ class BlockFactorization(eqx.Module):
         )
         if not checked:
             return factorization
-        return dataclasses.replace(factorization, full_rank=factorization._is_right(product))
+        return dataclasses.replace(factorization, usable=factorization._is_right(product))
 
     def solve(self, b: Float[Array, " m"]) -> Float[Array, " m"]:
         solve = lambda multiply, b: self._refined(self.eliminated, multiply, b)
@@ -57,17 +57,18 @@ class BlockFactorization(eqx.Module):
         )
 
     def _refined(self, eliminated: Any, multiply: Any, b: Float[Array, " m"]) -> Float[Array, " m"]:
-        """Refined once by products without the matrix, whose entries are rounded: near singular
-        positions that brings back a third of the digits. Tridiagonal matrices have none."""
+        """Solve with one step of iterative refinement: the products of `multiply` are more accurate
+        than the rounded entries of the matrix, and near singular positions that recovers a third of the
+        digits. Not done for tridiagonal matrices."""
         x = _in_order(self.structure, eliminated, b)
         if self.structure.width == 1:
             return x
         return x + _in_order(self.structure, eliminated, b - multiply(x))
 
     def solves(self, residual: Float[Array, " m"], size2: FloatScalar) -> BoolScalar:
-        """Whether what a refinement would change, `x' = A^-1 r`, is small: `r . x' = x' . A x'` beside
-        the `x . A x` of solutions, `size2`. Then the rank is full, no entry is missing, and `A` is not
-        too ill conditioned for the elimination; or else `A x = b` nevertheless."""
+        """Whether a refinement `x' = A^-1 r` would be small: `r . x' = x' . A x'` compared with
+        `x . A x` of the solutions, `size2`. If so, the rank is full, no entry is missing, and `A` is
+        not too ill conditioned for the elimination, or else `A x = b` nevertheless."""
         r = jax.lax.stop_gradient(residual)
         change2 = jnp.abs(jnp.dot(r, _in_order(self.structure, self.eliminated, r)))
         tolerance = float(jnp.finfo(r.dtype).eps) ** (1 / 3)
@@ -84,27 +85,28 @@ class BlockFactorization(eqx.Module):
         return jnp.sqrt(jnp.where(diagonal > 0, diagonal, 1))
 
     def _is_right(self, product: Any) -> BoolScalar:
-        """Test the solution of a system with a known solution: equations of any units."""
+        """Solve a system with a known solution, scaled to be independent of the units of the equations."""
         lengths = self.lengths
         mixed = jnp.arange(lengths.size, dtype=jnp.uint32) * jnp.uint32(2654435769)
         known = jnp.where(mixed >> 31 == 0, 1, -1).astype(lengths.dtype)  # signs without a pattern
         solution = self._refined(self.eliminated, product, product(known / lengths))
         error = jnp.max(jnp.abs(solution * lengths - known))
-        # Without full rank it is as large as the solution. Long chains are ill conditioned, so that
-        # little can be asked for in single precision: 1e-4 (2e-2).
+        # Without full rank the error is as large as the solution. Long chains are ill conditioned, so
+        # the tolerance is loose, above all in single precision: 1e-4 (2e-2).
         return error <= float(jnp.finfo(lengths.dtype).eps) ** (1 / 4)
 
 
 def _places(structure: Structure) -> Array:
-    """Return the places of the equations in the order of elimination. Behind a barrier, as the
-    compiler would evaluate what follows from it by itself, slowly."""
+    """Return the places of the equations in the order of elimination. A barrier keeps the compiler from
+    evaluating all that depends on them at compile time, slowly."""
     if structure.place is None:
         return jax.lax.optimization_barrier(jnp.arange(structure.num_equations, dtype=jnp.int32))
     return jax.lax.optimization_barrier(jnp.asarray(structure.place))
 
 
 def _blocks(product: Any, structure: Structure, dtype: Any) -> Blocks:
-    """Compute of every third block one column at a time: three colors of blocks do not meet."""
+    """Compute one column of every third block at a time: blocks of the same one of three colors have no
+    rows in common."""
     width, groups = structure.width, structure.num_blocks // 3
     places = _places(structure)
     wanted = jnp.arange(3 * width, dtype=jnp.int32)[:, None]

@@ -1,10 +1,10 @@
-"""Which equation depends on which unknown, found in time that grows with the number of both, not
-with their product.
+"""Sparsity pattern of a function, found in time that grows with the number of equations and of
+unknowns, not with their product.
 
-The traced function is walked through with hashed unknowns: each counts as one of `_GROUPS` groups
-in each of `_HASHES` random partitions. An equation can depend only on unknowns whose groups it
-depends on in all of them. None is missed, and those that are found by mistake are sorted out by new
-partitions (Bloom, Commun. ACM 13 (1970) 422-426).
+The traced function is evaluated with hashed unknowns: each counts as one of `_GROUPS` groups in each of
+`_HASHES` random partitions. An equation can depend only on unknowns whose groups it depends on in all
+of them. None is missed, and false positives are sorted out by new partitions (Bloom, Commun. ACM 13
+(1970) 422-426).
 """
 
 from collections.abc import Callable
@@ -23,8 +23,8 @@ _FULL = 0.25
 
 
 def dependence(function: Callable, x: Float[Array, " n"]) -> sp.csr_matrix | None:
-    """Return the dependence of `function(x)`, a vector: `(m, n)` with a one where equation `i`
-    depends on unknown `j`, for any values. `None` if most equations depend on very many."""
+    """Return the dependence of `function(x)`, a vector: `(m, n)` with a one where equation `i` depends
+    on unknown `j`, for any values. `None` if most equations depend on very many."""
     n = x.size
     if n <= _GROUPS * _HASHES:
         return sp.csr_matrix(incidence(function, (x, np.eye(n, dtype=bool))).depends)
@@ -42,7 +42,7 @@ def dependence(function: Callable, x: Float[Array, " n"]) -> sp.csr_matrix | Non
 
 
 def _hashed(function, x, random) -> tuple[np.ndarray, np.ndarray]:
-    """The group of each unknown in each partition, and what each equation depends on."""
+    """Return the group of each unknown in each partition, and the groups that each equation depends on."""
     numbers = np.arange(x.size)
     group = np.stack([random.permutation(x.size) % _GROUPS for _ in range(_HASHES)])
     group += _GROUPS * np.arange(_HASHES)[:, None]

@@ -30,7 +30,7 @@ class SparseRows(AbstractRows):
 
     @staticmethod
     def of(function: Callable, t, x, args, structure: Structure) -> "SparseRows":
-        # What the function closes over becomes an input, so that it is differentiated.
+        # Closed-over arrays become inputs, so that they are differentiated.
         function = convert_closure(function, t, x, args)
         return SparseRows(function, t, x, args, structure)
 

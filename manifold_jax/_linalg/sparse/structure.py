@@ -17,23 +17,21 @@ from .pattern import dependence
 
 Choice: TypeAlias = Literal["auto", "dense", "sparse"]
 
-# Equations from which on, and part of their number up to which blocks may be wide, so that the
-# sparse form is the faster one: `python -m benchmarks.speed.bandwidths`.
+# Number of equations from which on the sparse form is faster, and the largest width of blocks as a part
+# of that number for which it is: `python -m benchmarks.speed.bandwidths`.
 _SMALLEST = 32
 _WIDEST = 1 / 6
 
 
 class Structure:
-    """The sparsity structure of `m` equations in `n` unknowns, of which `per_block` neighbours
-    have masses that are coupled.
+    """The sparsity structure of `m` equations in `n` unknowns, of which `per_block` neighbours have
+    masses that are coupled.
 
-    - `order`: of the equations, in which `C M^-1 C^T` is block tridiagonal, and `place` of each of
-        them in it; `None` if it is their own.
+    - `order`: the order of the equations in which `C M^-1 C^T` is block tridiagonal, and `place` of each
+        of them in it; `None` if it is their own order.
     - `width`: the size of the blocks.
     - `color`: of each unknown; no equation depends on two of the same color.
     - `local`: the equations that depend on unknowns of one block of masses only.
-
-    Compared by contents: one that is found again is the same static field, and compiles nothing anew.
     """
 
     def __init__(self, depends: sp.csr_matrix, per_block: int):
@@ -68,7 +66,7 @@ class Structure:
 
     @property
     def num_blocks(self) -> int:
-        """The number of blocks with those that make it a multiple of three, for three colors."""
+        """Return the number of blocks, rounded up to a multiple of three, for three colors."""
         return 3 * -(-self.num_equations // (3 * self.width))
 
 
@@ -87,8 +85,8 @@ def choose_structure(
     equations: tuple[tuple[Callable, Float[Array, " n"]], ...],
     mass_shape: tuple[int, ...] = (),
 ) -> Structure | None:
-    """`None` for dense matrices. `equations` are functions of one vector each, of the same length,
-    whose numbers have the masses."""
+    """Return the structure, or `None` for dense matrices. `equations` are functions of one vector each,
+    all of the same length, whose numbers have the masses."""
     if choice == "dense":
         return None
     if len(mass_shape) == 2:
@@ -125,7 +123,7 @@ _MOST_FOUND = 64
 
 
 def structure_of(equations: Any, per_block: int = 1) -> Structure | None:
-    """Return the structure as for `choose_structure`, if there is any. Found once for each traced
+    """Return the structure as for `choose_structure`, if there is any. It is cached for each traced
     program, which is evaluated in many places."""
     key = per_block, *(_program(function, x) for function, x in equations)
     if key not in _FOUND:
@@ -140,7 +138,7 @@ def structure_of(equations: Any, per_block: int = 1) -> Structure | None:
 
 
 def _program(function: Callable, x: Float[Array, " n"]) -> tuple:
-    """The traced function as text, and the constants in it."""
+    """Return the traced function as text, and the constants in it."""
     closed = jax.make_jaxpr(function)(x)
     return str(closed.jaxpr), *(_constant(value) for value in closed.consts)
 
@@ -153,7 +151,7 @@ def _constant(value: Any) -> Any:
 
 
 def _merged(depends: sp.csr_matrix, per_block: int) -> sp.csr_matrix:
-    """Columns of the same block of masses joined."""
+    """Join the columns that belong to the same block of masses."""
     if per_block == 1:
         return depends.astype(np.int64)  # pyright: ignore[reportReturnType]
     entries = depends.tocoo()
@@ -164,7 +162,7 @@ def _merged(depends: sp.csr_matrix, per_block: int) -> sp.csr_matrix:
 
 
 def _best_order(coupled: sp.coo_matrix) -> tuple[np.ndarray | None, int]:
-    """The given order, or that of Cuthill and McKee (Proc. 24th ACM Nat. Conf. (1969) 157-172)."""
+    """Return the given order, or that of Cuthill and McKee (Proc. 24th ACM Nat. Conf. (1969) 157-172)."""
     own = np.arange(coupled.shape[0])  # pyright: ignore[reportOptionalSubscript]
     order = np.asarray(reverse_cuthill_mckee(coupled.tocsr(), symmetric_mode=True))
     given, reordered = _width(coupled, own), _width(coupled, np.argsort(order))
@@ -172,7 +170,7 @@ def _best_order(coupled: sp.coo_matrix) -> tuple[np.ndarray | None, int]:
 
 
 def _width(coupled: sp.coo_matrix, place: np.ndarray) -> int:
-    """The smallest blocks in which the matrix is block tridiagonal."""
+    """Return the smallest size of blocks for which the matrix is block tridiagonal."""
     i, j = place[coupled.row], place[coupled.col]
     band = max(1, int(np.abs(i - j).max(initial=1)))
     fits = lambda width: np.abs(i // width - j // width).max(initial=0) <= 1

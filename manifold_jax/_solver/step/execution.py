@@ -1,7 +1,7 @@
-"""How a step of the wrapped solver is executed: the one place where that is chosen.
+"""The ways in which a step of the wrapped solver is executed; the choice is made only here.
 
 - [`ExplicitStep`][]: an explicit Runge-Kutta step, stage by stage or in a loop over the stages.
-- [`CarriedDerivative`][]: Diffrax's own step of an implicit method, that begins with the derivative
+- [`CarriedDerivative`][]: Diffrax's own step of an implicit method, which begins with the derivative
   at which the step before ended.
 - [`OwnStep`][]: the solver's own step, whatever it is.
 """
@@ -21,8 +21,8 @@ from .implicit import carries_derivative, step_with_derivative
 
 
 class Step(NamedTuple):
-    """One attempted step: the state before it, after it, corrected and `raw`, the coordinates `w1`
-    at its end with their error estimate, and what is remembered."""
+    """One attempted step: the state before it and after it, corrected and `raw`, the coordinates `w1`
+    at its end with their error estimate, and the memory."""
 
     y0: Y
     y1: Y
@@ -36,7 +36,7 @@ class Step(NamedTuple):
 
 
 class AbstractExecution(eqx.Module):
-    """`memory` is what is carried from step to step, arrays of the same shapes in all of them."""
+    """An execution of steps; `memory` is carried from step to step, arrays of constant shapes."""
 
     solver: eqx.AbstractVar[dfx.AbstractSolver]
 
@@ -64,22 +64,22 @@ class AbstractExecution(eqx.Module):
         memory: Any,
         made_jump: Any,
     ) -> Step:
-        """One step, its end corrected. `terms` are those of the state, on the manifold;
-        `frame.terms` those of the coordinates at stages."""
+        """Make one step and correct its end. `terms` are those of the state, evaluated on the manifold;
+        `frame.terms` those of the coordinates, evaluated at stages."""
 
 
 class ExplicitStep(AbstractExecution):
-    """An explicit step of this library, that corrects the new state before the last stage."""
+    """An explicit step of this library, which corrects the new state before the last stage."""
 
     solver: dfx.AbstractSolver
-    in_a_loop: bool | None = None  # as is faster
+    in_a_loop: bool | None = None  # None: whichever is faster
 
     def initial_memory(self, terms, frame, t0, t1, y0, args):
         return terms.vf(t0, y0, args) if self.remembers_field else None
 
     @property
     def remembers_field(self) -> bool:
-        """Whether the memory is the vector field at the state, as steps end with it."""
+        """Whether the memory is the vector field at the state, with which a step ends."""
         return is_first_same_as_last(self._tableau)
 
     def step(self, terms, frame, t0, t1, y0, args, memory, made_jump) -> Step:
@@ -124,9 +124,9 @@ class OwnStep(AbstractExecution):
         return self.solver.init(terms, t0, t1, w0, args)
 
     def step(self, terms, frame, t0, t1, y0, args, memory, made_jump) -> Step:
-        # What a solver carried over belongs to the uncorrected state. Diffrax evaluates it anew
-        # if any lane of a batch needs it, so that keeping it would make the lanes depend on each
-        # other; always evaluating it does not.
+        # The memory of a solver belongs to the uncorrected state. Diffrax evaluates it again if any
+        # lane of a batch needs it, which would make lanes depend on each other; always evaluating it
+        # does not.
         w1, error, dense_info, memory, result = self.solver.step(
             frame.terms, t0, t1, frame.origin, args, memory, made_jump=True
         )
@@ -143,7 +143,7 @@ def execution_of(
     y0: Y,
     args: Args,
 ) -> AbstractExecution:
-    """The fastest way that does the same."""
+    """Choose the fastest implementation with the same result."""
     if is_unrollable(solver, terms, t0, t1, y0, args):
         return ExplicitStep(solver)
     if carries_derivative(solver, terms, t0, t1, y0, args):
@@ -152,14 +152,14 @@ def execution_of(
 
 
 def _in_coordinates(frame: StepFrame, terms: Any, y0: Y) -> tuple[Any, Y]:
-    """The differential equation of what is remembered of a step, and where that begins."""
+    """Return the terms from which the initial memory is computed, and where they begin."""
     return (terms, y0) if frame.state is None else (frame.terms, frame.origin)
 
 
 def _in_state(
     frame: StepFrame, y0: Y, w1: Y, dense_info: dict[str, Any]
 ) -> tuple[Y, dict[str, Any]]:
-    """The state that the solver's own interpolation leads to, and the data of it."""
+    """Return the state at the end of the solver's own interpolation, and the data of the interpolation."""
     if frame.state is None:
         return w1, dense_info
     return frame.state(y0, w1), dict(start=y0, **dense_info)

@@ -1,9 +1,8 @@
 """One explicit Runge-Kutta step, written out stage by stage or in a loop over the stages.
 
-Diffrax runs the stages in a loop with dynamic buffers. Writing them out lets XLA fuse a
-whole step of a small system, and lets the new state be corrected *before* the last stage
-is evaluated there, so that the derivative that a first-same-as-last method carries over
-belongs to the corrected state at no cost.
+Diffrax runs the stages in a loop with dynamic buffers. Writing them out lets XLA fuse a whole step of a
+small system, and lets the new state be corrected *before* the last stage is evaluated there, so that
+the derivative that a first-same-as-last method carries over belongs to the corrected state at no cost.
 """
 
 from collections.abc import Callable
@@ -23,19 +22,19 @@ from ..._jaxpr.trace import num_equations
 from .frame import StepFrame
 
 
-# Equations of the vector field times stages. With up to 210 (rigid body) a loop over the stages takes
-# 1.1 to 1.3 times as long as written out ones alone, and 1.7 to 2.7 times in a batch; from 1278
-# (double pendulum) 0.65 to 0.9 times, and 1830 equations (slider-crank) compile in 0.8 of the time.
-# jaxlib 0.10.2 and 0.12.0.1, `python -m benchmarks.speed.thresholds`.
+# Largest number of equations of the vector field times stages for which stages are written out. With up
+# to 210 (rigid body) a loop over the stages takes 1.1 to 1.3 times as long, and 1.7 to 2.7 times in a
+# batch; from 1278 (double pendulum) 0.65 to 0.9 times, and 1830 equations (slider-crank) compile in 0.8
+# of the time. jaxlib 0.10.2 and 0.12.0.1, `python -m benchmarks.speed.thresholds`.
 LARGEST_UNROLLED = 500
 
 
 def is_unrollable(solver: dfx.AbstractSolver, terms: Any, t0, t1, y0: Y, args: Args) -> bool:
-    """Explicit, one tableau, steps of Diffrax and not of a subclass, and a vector field that may be
-    evaluated on its own."""
+    """Whether the solver has an explicit method with one tableau and the step of Diffrax, not of a
+    subclass, and the vector field can be evaluated on its own."""
     return (
         isinstance(solver, dfx.AbstractERK)
-        and not isinstance(solver, dfx.AbstractWrappedSolver)  # which answers for its inner solver
+        and not isinstance(solver, dfx.AbstractWrappedSolver)  # answers for its inner solver
         and isinstance(solver.tableau, dfx.ButcherTableau)
         and all(_is_inherited(type(solver), name) for name in ("init", "step", "func"))
         and not terms.is_vf_expensive(t0, t1, y0, args)
@@ -50,10 +49,9 @@ def is_first_same_as_last(tableau: dfx.ButcherTableau) -> bool:
     return tableau.fsal and tableau.ssal
 
 
-class ExplicitStep(NamedTuple):
-    """The state at the end, the coordinates there, the embedded error estimate (of coordinates),
-    the data of the solver's own interpolation, the vector field of the last stage, and how the
-    correction went."""
+class ExplicitStepResult(NamedTuple):
+    """The state at the end, the coordinates there and their embedded error estimate, the data of the
+    solver's own interpolation, the vector field of the last stage, and the report of the correction."""
 
     y1: Y
     w1: Y
@@ -73,11 +71,11 @@ def explicit_step(
     args: Args,
     f0: Any,
     in_a_loop: bool | None = None,
-) -> ExplicitStep:
+) -> ExplicitStepResult:
     """Step from `y0`, with `f0` the vector field there, and correct the result.
 
-    `frame.terms` are evaluated at the stages, `terms` at states on the manifold. Stages are
-    evaluated in a loop if that is the faster way, unless told otherwise.
+    `frame.terms` are evaluated at the stages, `terms` at states on the manifold. By default stages are
+    evaluated in a loop if that is faster.
     """
     control = terms.contr(t0, t1)
     # Traced once, not once per stage.
@@ -87,7 +85,7 @@ def explicit_step(
         at_stage = at_corrected
     fsal = is_first_same_as_last(tableau)
     rows = list(tableau.a_lower)
-    # Not beyond `t1` by rounding, where the field may have jumped.
+    # Not rounded beyond `t1`, where the field may jump.
     times = [jnp.asarray(t1 if c == 1 else t0 + float(c) * (t1 - t0)) for c in tableau.c]
     w0, first = frame.origin, frame.pull_back(t0, frame.origin, y0, terms.prod(f0, control))
     inner_rows = rows[:-1] if fsal else rows
@@ -97,19 +95,19 @@ def explicit_step(
         in_a_loop = length * (len(inner_rows) + 1) > LARGEST_UNROLLED and bool(inner_rows)
     evaluate = _stages_in_a_loop if in_a_loop else _stages
     increments = evaluate(inner_rows, times[: len(inner_rows)], increment, w0, first)
-    # The last stage of a first-same-as-last method is taken at the new state itself.
+    # The last stage of a first-same-as-last method is evaluated at the corrected state.
     w1 = derivative_once(_combine(rows[-1] if fsal else tableau.b_sol, increments, w0), w0)
     y1, info = frame.correct(w1)
     f1 = None
     if fsal:
-        # A failed step may end in NaN, of which the derivative would be NaN, not zero.
+        # A failed step may end in NaN, whose derivative would be NaN instead of zero.
         safe = lambda a, b: jnp.where(info.success, a, jax.lax.stop_gradient(b))
         end, at_end = jnp.asarray(t1), jtu.tree_map(safe, y1, y0)
         f1 = at_corrected(end, at_end)
         increments.append(frame.pull_back(end, w1, at_end, terms.prod(f1, control)))
     error = _combine(tableau.b_error, increments)
     k = jtu.tree_map(lambda *ks: jnp.stack(ks), *increments)
-    return ExplicitStep(y1, w1, error, dict(y0=w0, y1=w1, k=k), f1, info)
+    return ExplicitStepResult(y1, w1, error, dict(y0=w0, y1=w1, k=k), f1, info)
 
 
 def _stages(rows: list[Any], times: list[Array], increment: Callable, w0: Y, first: Y) -> list[Y]:
@@ -122,7 +120,7 @@ def _stages(rows: list[Any], times: list[Array], increment: Callable, w0: Y, fir
 def _stages_in_a_loop(
     rows: list[Any], times: list[Array], increment: Callable, w0: Y, first: Y
 ) -> list[Y]:
-    """The same with the vector field compiled once, whatever the number of stages."""
+    """Compute the same with the vector field compiled once, whatever the number of stages."""
     count = len(rows) + 1
     padded = [np.pad(np.asarray(row, np.float64), (0, count - len(row))) for row in rows]
     buffer = jtu.tree_map(lambda k: jnp.zeros((count, *k.shape), k.dtype).at[0].set(k), first)
@@ -141,12 +139,12 @@ def _stages_in_a_loop(
 
 @jax.custom_jvp
 def derivative_once(y: Y, like: Y) -> Y:
-    """`y`, with a derivative that is computed once. `like` is any known state.
+    """Return `y`, with a derivative that is computed once. `like` is any known state.
 
     XLA for CPUs copies sums and products into every kernel that needs them, here the chain of all
-    stages into the derivative of each, but never a division. The derivative is therefore divided
-    by a one that XLA cannot tell from other numbers. Without, gradients take 1.1 (jaxlib 0.10.2) and
-    1.3 times (0.12.0.1) as long in a batch: `python -m benchmarks.speed.thresholds`.
+    stages into the derivative of each, but never a division. The derivative is therefore divided by a
+    one that XLA does not recognize. Without this, gradients take 1.1 (jaxlib 0.10.2) and 1.3 times
+    (0.12.0.1) as long in a batch: `python -m benchmarks.speed.thresholds`.
     """
     del like
     return y
@@ -161,7 +159,7 @@ def _derivative(primals: tuple[Y, Y], tangents: tuple[Y, Y]) -> tuple[Y, Y]:
 
 
 def _combine(weights: Any, increments: list[Y], start: Y | None = None) -> Y:
-    """`start + sum_i weights_i increments_i`, without the terms whose weight is zero."""
+    """Return `start + sum_i weights_i increments_i`, without the terms whose weight is zero."""
     used = [(float(w), k) for w, k in zip(weights, increments, strict=True) if w != 0]
     used = used or [(0.0, increments[0])]
     total = jtu.tree_map(
@@ -171,7 +169,7 @@ def _combine(weights: Any, increments: list[Y], start: Y | None = None) -> Y:
 
 
 def refreshed(made_jump: Any, f0: Any, evaluate: Callable[[], Any]) -> Any:
-    """The carried derivative, evaluated anew after a jump of the vector field."""
+    """Return the carried derivative, evaluated again after a jump of the vector field."""
     if made_jump is False:
         return f0
     return jax.lax.cond(made_jump, evaluate, lambda: f0)

@@ -1,4 +1,4 @@
-"""In what a step is computed: the state itself, or coordinates near it."""
+"""The coordinates in which a step is computed: the state itself, or local coordinates."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -12,15 +12,15 @@ from ..._constraint.projection_info import ProjectionInfo
 class StepFrame(NamedTuple):
     """The coordinates `w` that one step of a solver advances.
 
-    - `origin`: those of the state `y0` at which the step begins.
+    - `origin`: the coordinates of the state `y0` at which the step begins.
     - `terms`: the differential equation for them, evaluated at stages.
-    - `correct`: the state on the manifold that belongs to them at the end of the step.
-    - `pull_back`: `(t, w, y, vector)`, the velocity of coordinates of one of the state.
+    - `correct`: maps coordinates at the end of the step to the state on the manifold.
+    - `pull_back`: `(t, w, y, vector)`, maps a velocity of the state to one of the coordinates.
     - `state`: for dense output, `(y0, w)`: a state near that of the coordinates; `None` if it is
         `w` itself.
     - `error_of_state`: `(w1, y1, error)`, the error estimate of the state from that of the
         coordinates; `None` if they are the same.
-    - `verdict`: the result of a step that ends at a state, where `correct` does not look at it.
+    - `verdict`: the result of a step that ends at a state that `correct` does not check.
     """
 
     origin: Y
@@ -38,5 +38,5 @@ class StepFrame(NamedTuple):
         correct: Callable[[Y], tuple[Y, ProjectionInfo]],
         verdict: Callable[[Y], RESULTS] | None = None,
     ) -> "StepFrame":
-        """The state as its own coordinates."""
+        """Use the state as its own coordinates."""
         return StepFrame(y0, terms, correct, lambda t, w, y, vector: vector, verdict=verdict)

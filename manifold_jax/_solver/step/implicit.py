@@ -1,4 +1,4 @@
-"""Implicit stages: solved to round-off, and a derivative that is carried from step to step."""
+"""Implicit stages that are solved to round-off, and a derivative that is carried from step to step."""
 
 from typing import Any
 
@@ -15,19 +15,19 @@ from .explicit import refreshed
 from .frame import StepFrame
 
 
-# The most iterations, one less than Diffrax allows. A stage that is still not at round-off is that
-# of a fixed number of iterations then, and still does not depend on rounding.
+# The most iterations, one less than Diffrax allows. A stage that is not at round-off by then is the
+# result of a fixed number of iterations, which does not depend on rounding either.
 _MOST = 9
 
 
 class StageChord(optx.AbstractRootFinder):
-    r"""Simplified Newton iteration with one Jacobian per step, as `diffrax.VeryChord`, continued
-    until the stage is at round-off: `|dx| <= 8 eps |x|`, or not shrinking any more.
+    r"""Simplified Newton iteration with one Jacobian per step, as `diffrax.VeryChord`, continued until
+    the stage is at round-off: `|dx| <= 8 eps |x|`, or no longer shrinking.
 
-    `VeryChord` stops at a hundredth of the tolerance: whether it does so an iteration earlier or
-    later depends on rounding, and so do the steps that follow, which then differ between one
-    trajectory and the same in a batch. It also takes two iterates at rounding level, of which the
-    second is larger, for divergence, and most steps of some problems are rejected for that.
+    `VeryChord` stops at a hundredth of the tolerance: rounding decides whether it does so an iteration
+    earlier or later, and so do the steps that follow, which then differ between one trajectory and the
+    same in a batch. It also takes two iterates at rounding level, of which the second is larger, for
+    divergence, and rejects most steps of some problems for that.
 
     Succeeds where the error of the stage, estimated from the rate $\rho$ of convergence as
     $|dx| \rho / (1 - \rho)$, is below `kappa` times the tolerance.
@@ -37,7 +37,7 @@ class StageChord(optx.AbstractRootFinder):
 
     chord: dfx.VeryChord
 
-    # Replaced by Diffrax if they are to be those of the step size controller.
+    # Replaced by Diffrax if they are inherited from the step size controller.
     @property
     def rtol(self) -> Any:
         return self.chord.rtol
@@ -87,8 +87,7 @@ class StageChord(optx.AbstractRootFinder):
 
 
 def with_accurate_stages(solver: dfx.AbstractSolver) -> dfx.AbstractSolver:
-    """The solver with its implicit stages solved to round-off, unless it has a root finder of the
-    user's choice."""
+    """Return the solver with implicit stages solved to round-off, unless the user chose a root finder."""
     if isinstance(getattr(solver, "root_finder", None), dfx.VeryChord):
         return eqx.tree_at(lambda s: s.root_finder, solver, replace_fn=StageChord)  # pyright: ignore[reportArgumentType]
     return solver
@@ -97,9 +96,8 @@ def with_accurate_stages(solver: dfx.AbstractSolver) -> dfx.AbstractSolver:
 def with_tolerances_of_stages(
     solver: Any, controller: dfx.AbstractStepSizeController, y0: Y
 ) -> Any:
-    """Return a solver whose stages have tolerances. With constant steps there are no tolerances of
-    the steps that stages could inherit. They are
-    solved to round-off in any case, and count as solved where half of the digits are right."""
+    """Return a solver whose stages have tolerances. With constant steps there are none to inherit.
+    Stages are solved to round-off in any case, and count as solved if half of the digits are right."""
     if isinstance(controller, dfx.AbstractAdaptiveStepSizeController):
         return solver
     finder, names = getattr(solver, "root_finder", None), ("rtol", "atol", "norm")
@@ -116,7 +114,7 @@ def with_tolerances_of_stages(
 
 def carries_derivative(solver: dfx.AbstractSolver, terms: Any, t0, t1, y0: Y, args: Args) -> bool:
     """Whether the first stage of a step is the last one of the step before, in Diffrax's own
-    implementation: its state is then that derivative, and whether it is known."""
+    implementation: its solver state is then that derivative, and whether it is known."""
     return (
         isinstance(solver, dfx.AbstractImplicitSolver)
         and isinstance(solver, dfx.AbstractRungeKutta)
@@ -146,12 +144,13 @@ def step_with_derivative(
     derivative: Any,
     made_jump: Any,
 ) -> tuple[Y, Y | None, dict[str, Any], Any, Any]:
-    """A step that begins with `derivative`, evaluated anew only behind a jump of the field.
+    """Make a step that begins with `derivative`, which is evaluated again only after a jump of the
+    field.
 
-    It is that of the state before its correction. Where the field is stiff, one evaluated at the
-    corrected state would be wrong by the size of the correction times the stiffness. (Diffrax
-    itself evaluates it anew in all lanes of a batch if one of them needs it.) Coordinates that are
-    not states have another one in each step.
+    It belongs to the state before its correction. Where the field is stiff, one evaluated at the
+    corrected state would be wrong by the size of the correction times the stiffness. (Diffrax itself
+    evaluates it again in all lanes of a batch if one of them needs it.) Coordinates that are not states
+    have another one in each step.
     """
     if frame.state is None:
         derivative = refreshed(made_jump, derivative, lambda: solver.func(terms, t0, y0, args))

@@ -19,13 +19,13 @@ from ..compare.with_diffrax import LAST_MAX_STEPS, solve_task, SOLVERS
 from .sketches import SKETCHES
 
 
-_RATE, _DPI = 20, 75  # pictures in a second, dots in an inch
+_RATE, _DPI = 20, 75  # pictures per second, dots per inch
 _SHOWN = {"plain": ("plain", "tab:red"), "projected": ("projected", "tab:blue")}
 
 
 class Take(NamedTuple):
-    """One approach: its name, lines `(times, points, 2)`, and `max |g|`, the largest violation of
-    the constraint at each time; both infinite behind the end of a solve that failed."""
+    """One approach: its name, lines `(times, points, 2)`, and `max |g|`, the largest violation of the
+    constraint at each time; both infinite after the end of a solve that failed."""
 
     name: str
     lines: list[np.ndarray]
@@ -33,7 +33,7 @@ class Take(NamedTuple):
 
 
 def write_film(path: Path, task: Task, seconds: float) -> list[Take]:
-    """The last `seconds` of the task in their own time, as a GIF."""
+    """Write the last `seconds` of the task, in real time, as a GIF."""
     times = task.t1 - seconds + np.arange(round(seconds * _RATE)) / _RATE
     takes = [_take(task, one, times) for one in APPROACHES if one.name in _SHOWN]
     matplotlib.use("Agg")
@@ -43,7 +43,7 @@ def write_film(path: Path, task: Task, seconds: float) -> list[Take]:
     _set_limits(axes[0], takes)
     title = figure.suptitle(task.problem.name)
     figure.draw_without_rendering()
-    figure.set_layout_engine("none")  # nothing moves but the mechanism
+    figure.set_layout_engine("none")  # only the mechanism moves
 
     def show(frame: int) -> list[Any]:
         title.set_text(f"{task.problem.name}, tolerance {task.rtol:g}, t = {times[frame]:.1f}")
@@ -81,8 +81,7 @@ def _draw(ax: Axes, take: Take) -> tuple[list[Any], Any]:
 
 
 def _set_limits(ax: Axes, takes: Sequence[Take]) -> None:
-    """All of both, but nothing farther than the size of the mechanism from the last, which is as
-    it should be."""
+    """Show both, but nothing farther than the size of the mechanism from the projected one."""
     lower, upper = _extent(takes[-1].lines)
     room = max(upper - lower) * np.array([[1.0], [-1.0]]) * [0.5, 0.5]
     seen = np.array([_extent(take.lines) for take in takes])

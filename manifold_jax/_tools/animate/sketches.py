@@ -6,13 +6,13 @@ from typing import Any
 import numpy as np
 
 
-# Of positions `(times, n)` and parameters, lines `(times, points, 2)`. Each body is drawn from its
-# own coordinates: where equations do not hold, bodies do not meet.
+# Maps positions `(times, n)` and parameters to lines `(times, points, 2)`. Each body is drawn from its
+# own coordinates: where joints are violated, bodies do not meet.
 Sketch = Callable[[np.ndarray, Any], list[np.ndarray]]
 
 
 def _points(*points: Any) -> np.ndarray:
-    """A line through points given as `(x, y)`, numbers or arrays `(times,)`."""
+    """Return a line through points given as `(x, y)`, numbers or arrays `(times,)`."""
     pairs = [np.stack(np.broadcast_arrays(x, y), axis=-1) for x, y in points]
     return np.stack(np.broadcast_arrays(*pairs), axis=-2)
 
@@ -23,7 +23,7 @@ def _chain(q: np.ndarray, args: Any) -> list[np.ndarray]:
 
 
 def _slider_crank(q: np.ndarray, args: Any) -> list[np.ndarray]:
-    """The rod ends at the slider, and has the length 1."""
+    """Draw the rod from the slider, with length 1."""
     crank, slider, rod = q.T
     a = float(args.crank_length)
     return [

@@ -1,4 +1,4 @@
-"""The function that is differentiated: the end of a solve, of the parameters of a problem."""
+"""The function that is differentiated: the end of a solve as a function of the parameters of a problem."""
 
 import dataclasses
 from collections.abc import Callable
@@ -18,11 +18,10 @@ from ...problems import Problem
 from ..compare.approaches import Approach
 
 
-# Tolerance of implicit stages with steps that are given. Their derivative is that of the
-# exact root.
+# Tolerance of implicit stages with given steps. Their derivative is that of the exact root.
 _STAGES = 1e-12
-# Steps that a solve may take: Diffrax's default, with which most users run, and where that
-# is not enough. (It is a setting of checkpoints, too.)
+# Limits of steps: Diffrax's default, with which most users run, and a larger one where that does not
+# suffice. (Checkpoints depend on it, too.)
 _MAX_STEPS, _MORE_STEPS = 4096, 16384
 
 
@@ -30,7 +29,7 @@ Parameters: TypeAlias = Float[Array, " parameters"]
 
 
 class Stepping(NamedTuple):
-    """The solver, what chooses its steps, and how many there may be."""
+    """The solver, its step size controller, and the limit of steps."""
 
     solver: dfx.AbstractSolver
     controller: dfx.AbstractStepSizeController
@@ -39,14 +38,14 @@ class Stepping(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Case:
-    """One problem and approach, to be solved in two ways.
+    """One problem and approach, solved in two ways.
 
-    The parameters `theta` are those of the problem, or its initial state if it has none. What
-    depends on them is rebuilt: constraint, initial state, vector field.
+    The parameters `theta` are those of the problem, or its initial state if it has none. Constraint,
+    initial state and vector field are rebuilt for them.
 
     - `adaptive`: as users do it, the steps chosen anew in each solve.
     - `frozen`: with the steps of one adaptive solve, so that the discrete solution is a smooth
-        function of the parameters and has differences.
+        function of the parameters, which finite differences can be taken of.
     """
 
     problem: Problem
@@ -117,7 +116,7 @@ class Case:
     def end(
         self, theta: Parameters, adjoint: dfx.AbstractAdjoint, stepping: Stepping
     ) -> Float[Array, " n"]:
-        """The last state; not a number if the solve fails."""
+        """Return the last state; not a number if the solve fails."""
         sol = self._solve(theta, stepping, adjoint=adjoint, saveat=dfx.SaveAt(t1=True))
         y = jfu.ravel_pytree(sol.ys)[0]
         return jnp.where(sol.result == dfx.RESULTS.successful, y, jnp.nan)
@@ -130,7 +129,7 @@ class Case:
     def outcome(
         self, theta: Parameters, adjoint: dfx.AbstractAdjoint, stepping: Stepping
     ) -> tuple[Float[Array, ""], Float[Array, " n"], Float[Array, " m"]]:
-        """The objective, the last state, and `g` there: its derivative is zero where
+        """Return the objective, the last state, and `g` there: its derivative is zero where
         sensitivities are tangent."""
         problem, end = self.problem_at(theta), self.end(theta, adjoint, stepping)
         y = jfu.ravel_pytree(problem.y0)[1](end)
@@ -138,8 +137,7 @@ class Case:
         return _weighted_sum(end), end, residual
 
     def exact_gradient(self) -> np.ndarray | None:
-        """The gradient of the exact solution instead, by differences of it; `None` where it is not
-        known."""
+        """Return the gradient of the exact solution, by differences; `None` if it is not known."""
 
         def value(theta: np.ndarray) -> float:
             y = self.problem_at(jnp.asarray(theta)).reference(self.t1)
@@ -154,15 +152,15 @@ class Case:
 
 
 def _weighted_sum(y: Float[Array, " n"]) -> Float[Array, ""]:
-    """What is differentiated; the weights have no symmetry."""
+    """The function that is differentiated; the weights have no symmetry."""
     return y @ jnp.cos(1 + jnp.arange(y.size, dtype=y.dtype))
 
 
 def differences(value: Callable[[np.ndarray], float], theta: np.ndarray) -> np.ndarray:
-    """Central differences of sixth order, `theta_i` changed by at most 4e-4 of its size.
+    """Return central differences of sixth order, with `theta_i` changed by at most 4e-4 of its size.
 
-    Small, as charts are chosen anew along a solution: where a choice falls differently in
-    between, the discrete solution jumps by its own error.
+    Small, as charts are chosen anew along a solution: where that choice changes in between, the
+    discrete solution jumps by its own error.
     """
     gradient = np.empty_like(theta)
     for i, size in enumerate(np.maximum(np.abs(theta), 0.1)):

@@ -1,4 +1,4 @@
-"""All ways to a gradient, compared."""
+"""Comparison of all ways to compute a gradient."""
 
 import dataclasses
 from collections.abc import Callable, Iterable, Iterator
@@ -23,16 +23,16 @@ ADJOINTS: dict[str, dfx.AbstractAdjoint] = {
     "direct": dfx.DirectAdjoint(),
     "backsolve": dfx.BacksolveAdjoint(),
 }
-# The one that has to be refused: its gradient would be wrong through corrections.
+# The adjoint that has to be refused: its gradient would be wrong through corrections.
 REFUSED = "backsolve"
-# Diffrax's own, which cannot always be differentiated forwards once more.
+# Diffrax's default, which cannot always be differentiated forwards once more.
 ONCE = "checkpointed"
 
 
 @dataclasses.dataclass(frozen=True)
 class Check:
-    """One way to the gradient: how far it is from forward mode (relative, largest component),
-    and what it cost. `refused` is the message of an adjoint that was refused, instead.
+    """One way to the gradient: its difference from forward mode (relative, largest component), and its
+    cost. `refused` is the message of an adjoint that was refused.
 
     - `difference`: of the gradient.
     - `batch`: of `vmap` of the gradient, for two sets of parameters.
@@ -57,9 +57,8 @@ class Combination:
 
     - `differences`: of finite differences from forward mode, both with the same steps.
     - `exact`: of the gradient of the exact solution from forward mode, `None` if not known.
-    - `tangency`: the largest derivative of the residual at the end, relative to that of the
-        state.
-    - `failure`: why there is nothing to compare.
+    - `tangency`: the largest derivative of the residual at the end, relative to that of the state.
+    - `failure`: the reason why there is nothing to compare.
     """
 
     approach: str
@@ -73,7 +72,7 @@ class Combination:
 
 
 class _Forward(NamedTuple):
-    """What forward mode says.
+    """The results of forward mode.
 
     - `parameters`: several sets, of which the first is that of the problem.
     - `gradients`: for each of them.
@@ -93,7 +92,7 @@ def combinations(
     adjoints: dict[str, dfx.AbstractAdjoint],
     hessian: bool,
 ) -> Iterator[tuple[str, Combination | None]]:
-    """What is being compared, and the result once it is known, in turn."""
+    """Yield the name of each comparison with `None`, and then with its result."""
     solvers = list(solvers)
     for approach in approaches:
         for solver in solvers:
@@ -108,7 +107,7 @@ def combinations(
 
 def certify(case: Case, adjoints: dict[str, dfx.AbstractAdjoint], hessian: bool) -> Combination:
     """Compare the gradients of one approach and solver."""
-    if not case.is_corrected:  # then it is Diffrax's own approximation, of another kind
+    if not case.is_corrected:  # forward mode is then Diffrax's own approximation, of another kind
         adjoints = {name: a for name, a in adjoints.items() if name != REFUSED}
     parameters = jnp.stack([case.theta, 1.001 * case.theta])
     outcome = jax.jit(
@@ -135,7 +134,7 @@ def certify(case: Case, adjoints: dict[str, dfx.AbstractAdjoint], hessian: bool)
 
 
 def _by_differences(case: Case) -> float:
-    """How far finite differences are from forward mode, with the same steps."""
+    """Return the difference of finite differences from forward mode, with the same steps."""
 
     @jax.jit
     def value_and_gradient(theta):
@@ -175,7 +174,7 @@ def _hessian_difference(
         return None
     try:
         found = _along(gradient, forward.direction)(theta)
-    except (TypeError, ValueError):  # of JAX or Equinox: cannot be differentiated forwards
+    except (TypeError, ValueError):  # raised by JAX or Equinox: cannot be differentiated forwards
         return "refused"
     return _relative(np.asarray(found), forward.curvature)
 
@@ -187,7 +186,7 @@ def _gradient(case: Case, name: str, adjoint: dfx.AbstractAdjoint) -> Callable[[
 
 
 def _along(gradient: Callable[[Any], Any], direction: Any) -> Callable[[Any], Any]:
-    """The Hessian times `direction`."""
+    """Return the Hessian times `direction`."""
     return jax.jit(lambda theta: jax.jvp(gradient, (theta,), (direction,))[1])
 
 

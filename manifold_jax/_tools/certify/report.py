@@ -12,7 +12,7 @@ from ..compare.report import format_number, number_columns, write_strict_json
 from .checks import ADJOINTS, Check, Combination, ONCE, REFUSED
 
 
-# What a correct gradient satisfies.
+# Bounds that a correct gradient satisfies.
 REVERSE_BOUND, DIFFERENCES_BOUND = 1e-10, 1e-7
 
 
@@ -22,7 +22,7 @@ def certificate_title(combination: Combination) -> str:
 
 
 def certificate_table(combination: Combination) -> Table:
-    """The adjoints of one approach and solver."""
+    """Return the table of the adjoints of one approach and solver."""
     hessian = any(check.hessian is not None for check in combination.checks)
     headings = ["gradient", "batch", *(["Hessian"] if hessian else ())]
     headings += ["run\n(ms)", "compile\n(s)", "memory\n(kB)"]
@@ -44,7 +44,7 @@ def certificate_table(combination: Combination) -> Table:
 
 
 def certificate_notes(combination: Combination) -> list[str]:
-    """What else was found, and the verdict."""
+    """Return the other results, and the verdict."""
     exact = "not known" if combination.exact is None else combination.exact
     found = (
         f"Forward mode: {format_number(combination.differences, '.1e')} from finite differences with "
@@ -59,8 +59,8 @@ def certificate_notes(combination: Combination) -> list[str]:
 def certificate_scope(
     combinations: Sequence[Combination], missing: Sequence[str], left_out: Sequence[Approach]
 ) -> list[str]:
-    """How to read the certificate, and what it is silent about: the `missing` methods and
-    whatever else could have been asked for; those `left_out` cannot solve the problem."""
+    """Explain how to read the certificate, and what it does not cover: the `missing` methods and other
+    options; those `left_out` cannot solve the problem."""
     checks = [check for combination in combinations for check in combination.checks]
     done = {"forward", *(check.adjoint for check in checks)}
     adjoints = [name for name in ADJOINTS if name not in done]
@@ -81,8 +81,8 @@ def certificate_scope(
 
 
 def faults_of(combination: Combination) -> list[str]:
-    """Where gradients do not agree as well as they should, or something is refused that need
-    not be, or the other way round."""
+    """Return the gradients that do not agree as well as they should, and adjoints that are wrongly
+    refused or wrongly accepted."""
     if combination.failure is not None or combination.differences is None:
         return [combination.failure or "nothing was compared"]
     faults = [fault for check in combination.checks for fault in _faults_of_adjoint(check)]

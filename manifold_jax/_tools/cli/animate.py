@@ -1,4 +1,4 @@
-"""`manifold-jax animate`: what drift looks like."""
+"""`manifold-jax animate`: drift made visible."""
 
 from pathlib import Path
 from typing import Annotated
@@ -27,7 +27,10 @@ def animate(
     atol: options.AbsoluteTolerance = 1e-4,
     t1: Annotated[float, typer.Option(metavar="T", help="End of the time span.")] = 60.0,
     seconds: Annotated[
-        float, typer.Option(help="How much of its end to show, in the time of the problem.")
+        float,
+        typer.Option(
+            help="Length of the part at its end that is shown, in the time of the problem."
+        ),
     ] = 5.0,
 ) -> None:
     """Draw a planar mechanism in motion, without and with projection side by side.

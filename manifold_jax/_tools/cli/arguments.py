@@ -1,4 +1,4 @@
-"""What was asked for on the command line, or an error that says what could have been."""
+"""Arguments of the command line, with errors that list the valid ones."""
 
 import importlib
 import math
@@ -20,14 +20,14 @@ if TYPE_CHECKING:
     Way = TypeVar("Way", Approach, Method)
 
 
-# What matplotlib writes without further programs.
+# File types that matplotlib writes without further programs.
 FIGURE_TYPES = (".png", ".pdf", ".svg", ".jpg")
 
 
 def task_for(
     problem: str, solver: str, rtol: float, atol: float, t1: float | None, gain: float | None
 ) -> "Task":
-    """The task asked for, or an error that says what could have been asked for."""
+    """Return the task for the arguments, or raise an error that lists the valid ones."""
     from ...problems import ALL
     from ..compare.approaches import default_gain
     from ..compare.task import Task
@@ -52,7 +52,7 @@ def task_for(
 def choose(
     names: str | None, known: dict[str, "Way"], task: "Task"
 ) -> tuple[list["Way"], list["Way"]]:
-    """Choose, of the methods asked for, those that can solve the task, and those that cannot."""
+    """Divide the methods asked for into those that can solve the task, and those that cannot."""
     asked = list(known) if names is None else names_in(names, known, "method", "--methods")
     methods = [method for name, method in known.items() if name in asked]
     chosen = [m for m in methods if m.needs is None or m.needs.is_met_by(task.problem)]
@@ -66,7 +66,7 @@ def choose(
 
 
 def names_in(text: str, known: Iterable[str], kind: str, hint: str) -> list[str]:
-    """A list separated by commas, all of known names."""
+    """Return the names in a list separated by commas, all of them known."""
     names = [name.strip().lower() for name in text.split(",")]
     for name in names:
         check_name(name, known, kind, hint)
@@ -81,7 +81,7 @@ def check_name(name: str, known: Iterable[str], kind: str, hint: str) -> None:
 
 
 def model_at(place: str) -> tuple[Any, Any, Any, int]:
-    """What the function at `MODULE:FUNCTION` returns: `F`, `x_example`, `args_example`, `order`."""
+    """Return the results of `MODULE:FUNCTION`: `F`, `x_example`, `args_example`, `order`."""
     module, _, name = place.partition(":")
     if not module or not name:
         raise typer.BadParameter(
@@ -120,7 +120,7 @@ def check_can_draw(path: Path | None, option: str) -> None:
 
 
 def check_target(path: Path | None, option: str, suffixes: tuple[str, ...] | None) -> None:
-    """Say so before the computation if its result could not be written."""
+    """Raise before the computation if its result could not be written."""
     if path is None:
         return
     if suffixes is not None and path.suffix.lower() not in suffixes:

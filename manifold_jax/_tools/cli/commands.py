@@ -29,7 +29,7 @@ app = typer.Typer(
     "Computes in double precision.",
     no_args_is_help=True,
     add_completion=False,
-    rich_markup_mode="markdown",  # which joins the lines of a paragraph
+    rich_markup_mode="markdown",  # joins the lines of a paragraph
     pretty_exceptions_show_locals=False,
 )
 
@@ -98,11 +98,10 @@ def compare(
     violation max |g| at the ends of the steps and at 1001 output times, the largest error of
     the state there, the median run time and the time to compile.
 
-    The approaches: `plain` ignores the constraint; `projected` corrects every step to
-    round-off, `one-step` by one Newton iteration; `invariant`, `exact` and `baumgarte` stabilize
-    the vector field (the last for mechanical systems only); `tangent` and `partition` integrate
-    in local coordinates, of the tangent space and of some of the components, `lie-group` in the
-    algebra (for rotations).
+    The approaches: `plain` ignores the constraint; `projected` corrects every step to round-off,
+    `one-step` by one Newton iteration; `invariant`, `exact` and `baumgarte` stabilize the vector field
+    (the last for mechanical systems only); `tangent` and `partition` integrate in local coordinates, of
+    the tangent space and of some of the components, `lie-group` in the algebra (for rotations).
 
     The step limit that Diffrax needs is found automatically: 4096, doubled until the solve
     finishes, at most 1048576. It is stated below the table. A method that fails is reported
@@ -167,7 +166,9 @@ def certify(
     hessian: Annotated[
         bool, typer.Option("--hessian", help="Hessian-vector products, too (twice the time).")
     ] = False,
-    tolerance: Annotated[float, typer.Option(help="Of the steps, relative and absolute.")] = 1e-6,
+    tolerance: Annotated[
+        float, typer.Option(help="Tolerance of the steps, relative and absolute.")
+    ] = 1e-6,
     t1: options.EndTime = None,
     json: options.JsonFile = None,
 ) -> None:
@@ -263,10 +264,9 @@ def reduce(
 def paper() -> None:
     """Reprint Table 1 of the paper: Euler's method on a circle, plain and projected.
 
-    Local tolerances tau from 1e-1 to 1e-8 with steps h = sqrt(2 tau), N of them for one turn.
-    Without projection g(x_N) = (1 + 2 tau)^N - 1, by this closed form and as run; with
-    projection the largest |g| of all steps. Errors are distances from the solution at N h.
-    Takes a few seconds.
+    Local tolerances tau from 1e-1 to 1e-8 with steps h = sqrt(2 tau), N of them for one turn. Without
+    projection g(x_N) = (1 + 2 tau)^N - 1, by this closed form and as run; with projection the largest
+    |g| of all steps. Errors are distances from the solution at N h. Takes a few seconds.
     """
     from ..compare.paper import NOTES, paper_rows, paper_table, TAUS, TITLE
 

@@ -1,4 +1,4 @@
-"""Where the command line writes, and tables that fit there."""
+"""The consoles of the command line, and tables that fit them."""
 
 from collections.abc import Iterable, Sequence
 from typing import Any
@@ -10,13 +10,13 @@ from rich.table import Column, Table
 
 
 def output_console() -> Console:
-    """Standard output; wide enough for the tables if it is a file or a pipe."""
+    """Return standard output; wide enough for the tables if it is a file or a pipe."""
     console = Console()
     return console if console.is_terminal else Console(width=120)
 
 
 def progress_bar() -> Progress:
-    """What is being done, on standard error and only if that is a terminal."""
+    """Show what is being done, on standard error and only if that is a terminal."""
     console = Console(stderr=True)
     return Progress(
         SpinnerColumn(),
@@ -37,9 +37,8 @@ def print_lines(output: Console, lines: Iterable[str], **options: Any) -> None:
 def print_table(output: Console, table: Table) -> None:
     """Print a table without cutting anything, whatever the width.
 
-    Where there is little space its columns move together, and then it is printed in parts,
-    each with the first column. Only columns of text, which have a `min_width`, are wrapped.
-    A blank line follows.
+    If there is little space its columns move together, and then it is printed in parts, each with the
+    first column. Only columns of text, which have a `min_width`, are wrapped. A blank line follows.
     """
     name, *others = table.columns
     for gap in (3, 1):
@@ -55,7 +54,7 @@ def print_table(output: Console, table: Table) -> None:
 
 
 def _width(output: Console, columns: Sequence[Column], gap: int) -> int:
-    """The least width that cuts nothing."""
+    """Return the smallest width that cuts nothing."""
     whole = output.options.update(max_width=1000)
     return gap * (len(columns) - 1) + sum(
         column.min_width

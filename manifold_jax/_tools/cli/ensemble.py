@@ -6,6 +6,7 @@ from typing import Annotated, Any, TYPE_CHECKING
 
 import typer
 
+from ..._ensemble.api.solve_ensemble import DEFAULT_LANES
 from . import options
 from .arguments import task_for
 from .commands import app
@@ -36,10 +37,10 @@ def ensemble(
     rtol: options.RelativeTolerance = 1e-6,
     atol: options.AbsoluteTolerance = 1e-6,
     t1: options.EndTime = None,
-    seed: Annotated[int, typer.Option(help="Of the random numbers.")] = 0,
+    seed: Annotated[int, typer.Option(help="Seed of the random numbers.")] = 0,
     lanes: Annotated[
         int, typer.Option(min=1, help="How many trajectories advance together.")
-    ] = 128,
+    ] = DEFAULT_LANES,
     chunk: Annotated[
         int, typer.Option(min=1, help="How many are solved and written together.")
     ] = 8192,

@@ -39,7 +39,7 @@ class Distribution(NamedTuple):
         return f"{self.target}={self.kind}({self.a}, {self.b})"
 
 
-# Of each what its two numbers have to be.
+# Conditions on the two numbers of each kind.
 _KINDS = {
     "uniform": ("uniform(low, high) needs low < high", lambda a, b: a < b),
     "normal": ("normal(mean, std) needs std > 0", lambda a, b: b > 0),
@@ -49,8 +49,7 @@ _HINT = "--vary"
 
 
 def distributions(texts: list[str], problem: Problem) -> list[Distribution]:
-    """Read a distribution of `NAME=KIND(A,B)` each, or an error that says what could have been
-    asked for."""
+    """Read distributions from `NAME=KIND(A,B)`, or raise an error that lists the valid ones."""
     known = [*_names_in("args", problem.args), *_names_in("y0", problem.y0)]
     out: list[Distribution] = []
     for text in texts:
@@ -68,7 +67,7 @@ def distributions(texts: list[str], problem: Problem) -> list[Distribution]:
     return out
 
 
-# Parts of names whose numbers have a sign: of a negative mass there is a solution, but no mechanism.
+# Parts of the names of positive numbers: with a negative mass there is a solution, but no mechanism.
 _POSITIVE = ("length", "mass", "inertia", "radius")
 
 
@@ -93,9 +92,9 @@ def _numbers(text: str, kind: str, *words: str) -> tuple[float, float]:
     return a, b
 
 
-class Given(NamedTuple):
-    """What one trajectory has of its own besides its start: parameters, the arrays of its
-    constraint (values of invariants) and what was drawn, by name."""
+class DrawnArgs(NamedTuple):
+    """The data that one trajectory has of its own besides its start: parameters, the arrays of its
+    constraint (values of invariants) and the drawn numbers, by name."""
 
     args: Any
     constraint: Any
@@ -117,7 +116,7 @@ class VariedProblem:
         """Show the problem as the settings of the folder have it."""
         return f"{self.problem.name} with {', '.join(map(str, self.varied))}"
 
-    def sample(self, index: Array, key: Array) -> tuple[Any, Given]:
+    def sample(self, index: Array, key: Array) -> tuple[Any, DrawnArgs]:
         problem = self.problem
         dtype = jfu.ravel_pytree((problem.args, problem.y0))[0].dtype
         keys = jax.random.split(key, len(self.varied))
@@ -127,21 +126,22 @@ class VariedProblem:
             problem = problem.with_args(_replaced("args", problem.args, of_args))
         if len(of_args) < len(drawn):
             problem = problem.with_initial(_replaced("y0", problem.y0, drawn))
-        return problem.y0, Given(problem.args, eqx.filter(problem.constraint, eqx.is_array), drawn)
+        values = eqx.filter(problem.constraint, eqx.is_array)
+        return problem.y0, DrawnArgs(problem.args, values, drawn)
 
-    def saved(self, t: Any, y: Any, given: Given) -> dict[str, Any]:
-        """The state, by how much it violates the constraint (absolute), and what was drawn."""
+    def saved(self, t: Any, y: Any, given: DrawnArgs) -> dict[str, Any]:
+        """Return the state, its (absolute) constraint violation, and the drawn numbers."""
         residual = jfu.ravel_pytree(self.constraint(t, y, given))[0]
         return {"y": y, "violation": jnp.max(jnp.abs(residual)), "varied": given.drawn}
 
 
 class ConstraintInArgs(AbstractConstraint):
-    """A constraint whose arrays are those of each trajectory, in [`Given`][]."""
+    """A constraint whose arrays are taken from the [`DrawnArgs`][] of each trajectory."""
 
     template: AbstractConstraint
     redundant: bool = eqx.field(static=True)
 
-    def _of(self, given: Given) -> AbstractConstraint:
+    def _of(self, given: DrawnArgs) -> AbstractConstraint:
         return eqx.combine(given.constraint, self.template)
 
     def __call__(self, t: Any, y: Any, args: Any = None) -> Any:
@@ -164,13 +164,12 @@ class ConstraintInArgs(AbstractConstraint):
 
 
 def _names_in(name: str, tree: Any) -> list[str]:
-    """The names of the numbers in a tree, in the order in which it is ravelled: `args.length`,
-    `y0.0.1`."""
+    """Return the names of the numbers in a ravelled tree: `args.length`, `y0.0.1`."""
     out = []
     for path, leaf in jtu.tree_flatten_with_path(tree)[0]:
-        words = jtu.keystr(path, simple=True, separator=".")
+        path_name = jtu.keystr(path, simple=True, separator=".")
         for index in np.ndindex(*leaf.shape):
-            out.append(".".join(filter(None, [name, words, *map(str, index)])))
+            out.append(".".join(filter(None, [name, path_name, *map(str, index)])))
     return out
 
 

@@ -18,15 +18,15 @@ from ...problems import Problem
 
 
 class Formulation(NamedTuple):
-    """What to integrate: the function that solves, and its first two arguments."""
+    """A problem as it is integrated: the function that solves, and its first two arguments."""
 
     function: Callable[..., dfx.Solution]
     terms: dfx.AbstractTerm
     solver: dfx.AbstractSolver
 
     def solve(self, t0: Any, t1: Any, y0: Any, args: Any, **options: Any) -> dfx.Solution:
-        """The solution, with further options of `diffrax.diffeqsolve`; its `result` says whether the
-        solve failed."""
+        """Return the solution, with further options of `diffrax.diffeqsolve`; its `result` says whether
+        the solve failed."""
         return self.function(
             self.terms, self.solver, t0, t1, None, y0, args, throw=False, **options
         )
@@ -36,7 +36,7 @@ Formulate = Callable[[Problem, dfx.AbstractSolver, float], Formulation]
 
 
 class Need(NamedTuple):
-    """What not every problem has: the attribute that is None then, and what it is called."""
+    """A requirement that not every problem meets: the attribute that is None then, and its name."""
 
     attribute: str
     phrase: str
@@ -53,7 +53,7 @@ CHART = Need("chart", "a chart of its own")
 
 
 class Style(NamedTuple):
-    """How a curve is drawn: colour-blind safe (Okabe & Ito), related approaches share a hue."""
+    """The style of a curve: colour-blind safe (Okabe & Ito), related approaches share a hue."""
 
     colour: str
     line: str = "solid"
@@ -61,13 +61,13 @@ class Style(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Approach:
-    """One way to keep a solution on (or near) a manifold: all that tables, pictures, certificates
-    and benchmarks know of it.
+    """One way to keep a solution on (or near) a manifold, for tables, pictures, certificates and
+    benchmarks.
 
     - `name`: on the command line and in tables.
     - `formulate`: of a problem, a Diffrax solver and a gain (1/time, for stabilization).
     - `style`: in pictures.
-    - `needs`: what a problem has to have, `None` if it is for all.
+    - `needs`: a requirement on the problem, `None` if it is for all.
     - `uses_gain`: whether the gain matters.
 
     Those of other packages are found by the entry point group `manifold_jax.approaches`, each a
@@ -82,10 +82,10 @@ class Approach:
 
 
 def default_gain(problem: Problem) -> float:
-    """Violations decay by `exp(-30)` in the time span of the problem.
+    """Return the gain with which violations decay by `exp(-30)` in the time span of the problem.
 
-    Measured on seven problems of the gallery (Tsit5, tolerances 1e-4 to 1e-8): ten times that
-    gain takes up to 6 times as many steps, for violations at most 4 times smaller.
+    Measured on seven problems of the gallery (Tsit5, tolerances 1e-4 to 1e-8): ten times that gain
+    takes up to 6 times as many steps, for violations at most 4 times smaller.
     """
     return 30 / (problem.t1 - problem.t0)
 
@@ -97,7 +97,7 @@ def _plain(problem: Problem, solver: dfx.AbstractSolver, gain: float) -> Formula
 def _within(
     hook: Callable, options: Callable[[Problem, float], dict[str, Any]] = lambda problem, gain: {}
 ) -> Formulate:
-    """The solver in a step hook of this library, with `options(problem, gain)`; the field as it is."""
+    """Use the solver in a step hook of this library, with `options(problem, gain)`."""
 
     def formulate(problem: Problem, solver: dfx.AbstractSolver, gain: float) -> Formulation:
         wrapped = hook(solver, problem.constraint, **options(problem, gain))
@@ -118,7 +118,7 @@ _lie_group = _within(LocalCoordinates, lambda problem, gain: {"chart": problem.c
 
 
 def _baumgarte(problem: Problem, solver: dfx.AbstractSolver, gain: float) -> Formulation:
-    """Critical damping."""
+    """Stabilize with critical damping."""
     assert problem.system is not None
     system = eqx.tree_at(
         lambda s: s.stabilization,
@@ -150,5 +150,5 @@ APPROACHES: tuple[Approach, ...] = (
 
 
 def with_vector_field(terms: Any, wrap: Callable[[Callable], Callable]) -> Any:
-    """The same terms with `wrap(f)` in place of their vector field `f(t, y, args)`."""
+    """Return the same terms with `wrap(f)` in place of their vector field `f(t, y, args)`."""
     return eqx.tree_at(lambda term: term.vector_field, terms, wrap(terms.vector_field))

@@ -20,11 +20,11 @@ from .task import Task
 STYLES: dict[str, Style] = {method.key: method.style for method in METHODS}
 # A violation or an error of exactly zero is drawn here.
 FLOOR = 1e-17
-# Curves show the largest value in each of so many intervals: rounding errors and changes of
-# sign would fill the panels.
+# Curves show the largest value in each of this many intervals: rounding errors and changes of sign
+# would fill the panels.
 INTERVALS = 100
 
-# Measurements without failures, and how they are drawn.
+# Measurements without failures, with the styles of their curves.
 Solved: TypeAlias = Sequence[tuple[Any, dict[str, Any]]]
 
 
@@ -53,8 +53,8 @@ def _style(key: str) -> dict[str, Any]:
 
 
 def _draw_path(axes: Axes, task: Task, solved: Solved, dimension: int) -> None:
-    """The first leaf as a curve in the plane or in space."""
-    # Nested, the first the widest: usually the curves are the same to the eye.
+    """Draw the first leaf as a curve in the plane or in space."""
+    # Nested, the first the widest: usually the curves look the same.
     for i, (measurement, style) in enumerate(solved):
         width = 1 + 0.7 * (len(solved) - 1 - i)
         axes.plot(*measurement.states[:, :dimension].T, color=style["color"], linewidth=width)
@@ -78,10 +78,10 @@ def _draw_path(axes: Axes, task: Task, solved: Solved, dimension: int) -> None:
 
 
 def _draw_components(axes: Axes, task: Task, solved: Solved, count: int) -> None:
-    """The first leaf over time, if it has too many components for a curve.
+    """Draw the first leaf over time, if it has too many components for a curve.
 
-    Of one method only, as the lines of several could not be told apart; the other panels
-    show the differences.
+    For one method only, as the lines of several could not be told apart; the other panels show the
+    differences.
     """
     if not solved:
         return
@@ -124,7 +124,7 @@ def _draw_errors(axes: Axes, task: Task, solved: Solved) -> None:
 
 
 def _largest_in_intervals(times: Any, values: Any) -> tuple[np.ndarray, np.ndarray]:
-    """The middles of the intervals, and the largest value in each."""
+    """Return the middles of the intervals, and the largest value in each."""
     middles = [np.mean(part) for part in np.array_split(times, INTERVALS)]
     largest = [np.max(part) for part in np.array_split(values, INTERVALS)]
     return np.array(middles), np.maximum(largest, FLOOR)

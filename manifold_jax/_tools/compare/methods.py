@@ -1,4 +1,4 @@
-"""The methods that are compared, and what is measured of each."""
+"""The methods that are compared, and the measurements of each."""
 
 import dataclasses
 import functools
@@ -59,10 +59,10 @@ METHODS: tuple[Method, ...] = (
 
 @dataclasses.dataclass(frozen=True)
 class Row:
-    """One line of the table and of the JSON file; `None` where a number is not known.
+    """One line of the table and of the JSON file; `None` for unknown numbers.
 
-    Violations are the largest `|g|`, at the ends of the steps and on the output grid;
-    `error` is the largest error of a state component where the solution is known.
+    Violations are the largest `|g|`, at the ends of the steps and on the output grid; `error` is the
+    largest error of a state component where the solution is known.
     """
 
     method: str
@@ -103,7 +103,7 @@ def measure(task: Task, method: Method) -> Measurement:
             raise SolveFailed("the solution is not finite")
     except SolveFailed as error:
         return Measurement(key, Row(name), failure=str(error))
-    except Exception as error:  # of a library: the other methods are still of interest
+    except Exception as error:  # raised by a library: the other methods are still of interest
         reason = str(error).strip().partition("\n")[0]
         return Measurement(key, Row(name), failure=f"{type(error).__name__}: {reason}")
     violations = task.violations(task.grid, run.output)
@@ -127,7 +127,7 @@ def measure(task: Task, method: Method) -> Measurement:
 
 
 def _errors(task: Task, run: Run) -> tuple[np.ndarray | None, np.ndarray | None]:
-    """Where the solution is known, and the largest error of a component there."""
+    """Return where the solution is known, and the largest error of a component there."""
     known = task.reference()
     if known is None:
         return None, None

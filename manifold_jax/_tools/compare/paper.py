@@ -51,7 +51,7 @@ class PaperRow(NamedTuple):
 
 
 def paper_rows(taus: tuple[float, ...] = TAUS) -> Iterator[PaperRow]:
-    """Table 1, line by line."""
+    """Yield Table 1 line by line."""
     # One limit for all lines, so that one program is compiled for all.
     limit = max(_steps_of_one_turn(math.sqrt(2 * tau)) for tau in taus)
     constraint = harmonic_oscillator().constraint
@@ -84,7 +84,7 @@ def _residual(x: np.ndarray) -> np.ndarray:
 
 
 def _euler(solver: dfx.AbstractSolver, h: float, N: int, limit: int) -> np.ndarray:
-    """`N` steps of size `h`: the states after each."""
+    """Return the states after each of `N` steps of size `h`."""
     problem = harmonic_oscillator()
     sol = diffeqsolve(
         problem.terms,
@@ -104,7 +104,7 @@ def _euler(solver: dfx.AbstractSolver, h: float, N: int, limit: int) -> np.ndarr
 
 
 def _digits(count: int) -> Callable[[float], str]:
-    """So many significant digits, with an exponent (without padding) below 1."""
+    """Format this many significant digits, with an exponent (without padding) below 1."""
 
     def shown(value: float) -> str:
         if 1 <= value < 10**count:

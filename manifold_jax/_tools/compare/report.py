@@ -28,7 +28,7 @@ def number_columns(headings: Iterable[str]) -> list[Column]:
 
 
 def format_number(value: int | float | str | None, form: str) -> str:
-    """A number in a table, in which a word may stand instead, and `-` for what is not known.
+    """Format a number in a table, in which a word may stand instead, and `-` for unknown ones.
     Where `form` asks for three digits, larger numbers have all before the point."""
     if isinstance(value, str):
         return value
@@ -38,7 +38,7 @@ def format_number(value: int | float | str | None, form: str) -> str:
 
 
 def sizes(problem: Problem) -> tuple[int, int]:
-    """The number of states and the number of constraints, `n` and `m`."""
+    """Return the number of states and the number of constraints, `n` and `m`."""
     flat = lambda y: jfu.ravel_pytree(problem.constraint(problem.t0, y, problem.args))[0]
     return jfu.ravel_pytree(problem.y0)[0].size, jax.eval_shape(flat, problem.y0).size
 
@@ -59,7 +59,7 @@ def gallery_table(gallery: dict[str, Callable[[], Problem]]) -> Table:
 
 
 def summary(build: Callable[[], Problem]) -> str:
-    """What a problem is, in one line: the beginning of its docstring, without mathematics."""
+    """Describe a problem in one line: the beginning of its docstring, without mathematics."""
     paragraph = (inspect.getdoc(build) or "").partition("\n\n")[0]
     text = " ".join(paragraph.split())
     return re.split(r"[,:.]( |$)", text, maxsplit=1)[0].replace("$", "")
@@ -70,7 +70,7 @@ def comparison_title(task: Task) -> str:
     return f"{task.problem.name}, {task.solver}, {span}, rtol = {task.rtol:g}, atol = {task.atol:g}"
 
 
-# Headings short, so that they fit in a terminal of 80 columns; then the number of a row, and its form.
+# Headings that fit in a terminal of 80 columns; then the attribute of a row, and its format.
 _COLUMNS = {
     "steps\naccepted": ("accepted", "d"),
     "\nrejected": ("rejected", "d"),
@@ -97,7 +97,7 @@ def comparison_table(measurements: Sequence[Measurement]) -> Table:
 def comparison_notes(
     task: Task, measurements: Sequence[Measurement], left_out: Sequence[Method]
 ) -> list[str]:
-    """How to read the table, below it."""
+    """Return the notes below the table that explain it."""
     if task.reference() is None:
         known = "is not known for this time span (without --t1 it is)"
     elif task.problem.reference_at_end_only:
@@ -125,7 +125,7 @@ def comparison_notes(
 
 
 def max_steps(measurements: Sequence[Measurement]) -> int | None:
-    """The largest limit that a solve needed."""
+    """Return the largest limit that a solve needed."""
     limits = [m.max_steps for m in measurements if m.max_steps is not None]
     return max(limits, default=None)
 
@@ -133,7 +133,7 @@ def max_steps(measurements: Sequence[Measurement]) -> int | None:
 def write_json(
     path: Path, task: Task, measurements: Sequence[Measurement], left_out: Sequence[Method]
 ) -> None:
-    """Everything in the table and how it was made. Unknown numbers are null."""
+    """Write everything in the table and how it was made. Unknown numbers are null."""
     n, m = sizes(task.problem)
     settings = {
         **{name: getattr(task, name) for name in ("solver", "rtol", "atol", "gain", "t0", "t1")},
@@ -155,7 +155,7 @@ def write_json(
 
 
 def write_strict_json(path: Path, content: dict[str, Any]) -> None:
-    """Write null for what JSON has no numbers for, NaN and infinity."""
+    """Write null for numbers that JSON does not have, NaN and infinity."""
     path.write_text(json.dumps(_strict(content), indent=2, allow_nan=False) + "\n")
 
 

@@ -1,4 +1,4 @@
-"""What is solved, and what a method hands back."""
+"""The tasks that methods solve, and the results that they return."""
 
 import dataclasses
 import statistics
@@ -15,13 +15,13 @@ import numpy as np
 from ...problems import Problem
 
 
-# Short runs are repeated until the median settles; of long ones three must do.
+# Short runs are repeated until the median settles; long ones three times only.
 MIN_RUNS, MAX_RUNS = 3, 50
 TIME_BUDGET = 1.0  # seconds
 
 
 def median_ms(run: Callable[[], Any]) -> float:
-    """Median duration of `run()` in milliseconds. Warm up before; `run` has to block."""
+    """Return the median duration of `run()` in milliseconds. Warm up before; `run` has to block."""
     durations: list[float] = []
     while len(durations) < MIN_RUNS or (len(durations) < MAX_RUNS and sum(durations) < TIME_BUDGET):
         start = time.perf_counter()
@@ -31,7 +31,7 @@ def median_ms(run: Callable[[], Any]) -> float:
 
 
 def compiled(function: Any, *arguments: Any) -> tuple[jax.stages.Compiled, float]:
-    """The program of a `jax.jit` function, and the seconds it took to trace and compile."""
+    """Return the program of a `jax.jit` function, and the seconds it took to trace and compile."""
     start = time.perf_counter()
     program = function.lower(*arguments).compile()
     return program, time.perf_counter() - start
@@ -42,7 +42,7 @@ OUTPUT_POINTS = 1001
 
 
 class SolveFailed(Exception):
-    """A method could not solve the task; the message is the reason, for the table."""
+    """Raised if a method could not solve the task; the message is the reason, for the table."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -51,8 +51,8 @@ class Task:
 
     `gain` (1/time) is that of the methods that stabilize.
 
-    States are rows of arrays `(times, n)` here, the leaves of `y` one after another, so
-    that all libraries are treated alike.
+    States are rows of arrays `(times, n)` here, the leaves of `y` one after another, so that all
+    libraries are treated alike.
     """
 
     problem: Problem
@@ -71,7 +71,7 @@ class Task:
         return np.linspace(self.t0, self.t1, OUTPUT_POINTS)
 
     def violations(self, times: np.ndarray, rows: np.ndarray) -> np.ndarray:
-        """`max_i |g_i|` at each time, absolute (unlike `mj.constraint_violation`)."""
+        """Return `max_i |g_i|` at each time, absolute (unlike `mj.constraint_violation`)."""
         problem, unravel = self.problem, jfu.ravel_pytree(self.problem.y0)[1]
 
         def residual(t, x):
@@ -81,7 +81,7 @@ class Task:
         return np.max(np.abs(np.asarray(g)), axis=1)
 
     def reference(self) -> tuple[np.ndarray, np.ndarray] | None:
-        """Indices into the output grid where the solution is known, and the states there."""
+        """Return indices into the output grid where the solution is known, and the states there."""
         indices = np.arange(OUTPUT_POINTS)
         if self.problem.reference_at_end_only:
             if self.t1 != self.problem.t1:
@@ -110,6 +110,6 @@ class Run:
 
 
 def as_rows(ys: Any) -> np.ndarray:
-    """A trajectory, a pytree with a leading axis for the times, as one array `(times, n)`."""
+    """Return a trajectory, a pytree with a leading axis for the times, as one array `(times, n)`."""
     leaves = [np.asarray(leaf) for leaf in jtu.tree_leaves(ys)]
     return np.concatenate([leaf.reshape(leaf.shape[0], -1) for leaf in leaves], axis=1)

@@ -23,14 +23,14 @@ SOLVERS: dict[str, type[dfx.AbstractSolver]] = {
     )
 }  # fmt: skip
 
-# Diffrax has to know the number of steps beforehand: the limit starts at Diffrax's own
-# default and is doubled until the solve finishes, up to about a minute of steps.
+# Diffrax has to know the number of steps beforehand: the limit starts at Diffrax's own default and is
+# doubled until the solve finishes, up to about a minute of steps.
 FIRST_MAX_STEPS = 4096
 LAST_MAX_STEPS = 2**20
 
 
 def run_diffrax(task: Task, approach: Approach) -> Run:
-    """The solver that the task names, within one of the approaches."""
+    """Run the solver that the task names, within one of the approaches."""
     solve = approach.formulate(task.problem, SOLVERS[task.solver](), task.gain)
     # The ends of the steps, too: another program for them would take as long to compile.
     saveat = dfx.SaveAt(subs=[dfx.SubSaveAt(ts=jnp.asarray(task.grid)), dfx.SubSaveAt(steps=True)])
@@ -62,7 +62,7 @@ def run_diffrax(task: Task, approach: Approach) -> Run:
 def solve_task(
     task: Task, formulation: Formulation, y0: Any, args: Any, saveat: dfx.SaveAt, max_steps: int
 ) -> dfx.Solution:
-    """A solve over the time span of the task and with its tolerances."""
+    """Solve over the time span of the task and with its tolerances."""
     controller = dfx.PIDController(rtol=task.rtol, atol=task.atol)
     options = dict(saveat=saveat, stepsize_controller=controller, max_steps=max_steps)
     return formulation.solve(task.t0, task.t1, y0, args, **options)
@@ -71,17 +71,17 @@ def solve_task(
 def _compiled(
     task: Task, solve: Formulation, saveat: dfx.SaveAt, max_steps: int
 ) -> tuple[Callable[[], Any], float]:
-    """The program, ready to run to its end, and the seconds it took to trace and compile."""
+    """Return the program, ready to run to its end, and the seconds it took to trace and compile."""
     problem = task.problem
     run = lambda y0, args: solve_task(task, solve, y0, args, saveat, max_steps)
-    # Otherwise the second method profits from what was traced for the first.
+    # Otherwise the second method would profit from what was traced for the first.
     jax.clear_caches()
     program, seconds = compiled(jax.jit(run), problem.y0, problem.args)
     return lambda: jax.block_until_ready(program(problem.y0, problem.args)), seconds
 
 
 def _sufficient_max_steps(task: Task, solve: Formulation) -> int:
-    """The first of 4096, 8192, ... with which the solve finishes.
+    """Return the first of 4096, 8192, ... with which the solve finishes.
 
     Found by one solve that keeps the end only, as each limit is another program to compile.
     """
@@ -106,7 +106,7 @@ def _raise_if_failed(outcome: dfx.Solution) -> None:
 
 
 def _counted_evaluations(task: Task, solve: Formulation, max_steps: int) -> int:
-    """Evaluations of the vector field, counted as they happen."""
+    """Count evaluations of the vector field as they happen."""
     count = 0
 
     def increment():
@@ -129,10 +129,11 @@ def _counted_evaluations(task: Task, solve: Formulation, max_steps: int) -> int:
 
 
 def _explicit_evaluations(task: Task, solve: Formulation, steps: int) -> int | None:
-    """Evaluations of the vector field by an explicit solver in so many steps, accepted or not.
+    """Return the number of evaluations of the vector field by an explicit solver in so many steps,
+    accepted or not.
 
-    One for each stage, in every approach; the last stage is the first one of the next step if
-    the tableau says so. (A callback that counts takes some 10 us.)
+    One for each stage, in every approach; the last stage is the first one of the next step if the
+    tableau says so. (A callback that counts takes some 10 us.)
     """
     solver = SOLVERS[task.solver]()
     if not isinstance(solver, dfx.AbstractERK):
@@ -144,6 +145,6 @@ def _explicit_evaluations(task: Task, solve: Formulation, steps: int) -> int | N
     if solve.function is not diffeqsolve:
         return in_steps
     # Two evaluations choose the first step (Diffrax starts with 0.01 whatever the problem), of which
-    # the first is the one at the start, unless it is the stabilized field that is needed there.
+    # the first is the one at the start, unless the step needs the stabilized field there.
     shared = reused and not isinstance(solve.solver, Stabilized)
     return in_steps + (1 if shared else 2)

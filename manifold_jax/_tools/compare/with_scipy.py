@@ -1,4 +1,4 @@
-"""SciPy's solvers on the same vector field, as a yardstick."""
+"""SciPy's solvers on the same vector field, for comparison."""
 
 import warnings
 from typing import Any
@@ -12,11 +12,10 @@ from .task import median_ms, Run, SolveFailed, Task
 
 
 def run_scipy(task: Task, method: str) -> Run:
-    """`scipy.integrate.solve_ivp`, which calls the compiled vector field from Python.
+    """Run `scipy.integrate.solve_ivp`, which calls the compiled vector field from Python.
 
-    SciPy does not report rejected steps. Evaluations are those of the timed run with
-    output on the grid (DOP853 needs three more per step for it); LSODA's contain the
-    differences for its Jacobians.
+    SciPy does not report rejected steps. Evaluations are those of the timed run with output on the grid
+    (DOP853 needs three more per step for it); LSODA's contain the differences for its Jacobians.
     """
     problem = task.problem
     x0, unravel = jfu.ravel_pytree(problem.y0)
@@ -27,7 +26,7 @@ def run_scipy(task: Task, method: str) -> Run:
 
     def solve(grid: np.ndarray | None) -> Any:
         with warnings.catch_warnings():
-            # about tolerances that it raises, and steps that fail: the result says it too
+            # about tolerances that it raises, and failed steps, which the result reports, too
             warnings.simplefilter("ignore")
             return scipy.integrate.solve_ivp(
                 lambda t, x: np.asarray(field(t, x)),

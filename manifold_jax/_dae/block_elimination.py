@@ -1,4 +1,4 @@
-"""Linear systems with constant pivots, which are eliminated first."""
+"""Block elimination: constant pivots are eliminated before the rest of a linear system is factored."""
 
 from typing import Any, Literal, NamedTuple
 
@@ -14,13 +14,13 @@ from .compressed import Compressed
 from .derivatives import pick
 
 
-# Of a pivot, relative to the largest entry of its row.
+# Smallest size of a pivot, relative to the largest entry of its row.
 _SMALLEST_PIVOT = 1e-6
 
 
 class Elimination(NamedTuple):
-    """Which pivots are taken: `J[rows, columns]` is diagonal and constant. What is left may be
-    symmetric and definite, positive or negative (`sign`), or not (0)."""
+    """The pivots `J[rows, columns]`, a diagonal and constant block. `sign` is 1 or -1 if the rest is
+    symmetric and positive or negative definite, else 0."""
 
     rows: np.ndarray
     columns: np.ndarray
@@ -45,7 +45,7 @@ class Elimination(NamedTuple):
 def _independent_pivots(
     constant: np.ndarray, samples: list[np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Greedily: no entry in the row or column of another."""
+    """Choose pivots greedily: no entry in the row or column of another."""
     size = np.min([np.abs(J) / np.abs(J).max(axis=1, keepdims=True) for J in samples], axis=0)
     there = np.any([J != 0 for J in samples], axis=0)
     good = constant & (size > _SMALLEST_PIVOT)
@@ -91,9 +91,9 @@ class Eliminated(NamedTuple):
         return Eliminated(plan, pivots, right, below, rest)
 
     @property
-    def full_rank(self) -> BoolScalar:
-        regular = jnp.all(self.pivots != 0)
-        return regular if self.rest is None else regular & self.rest.full_rank
+    def usable(self) -> BoolScalar:
+        nonzero = jnp.all(self.pivots != 0)
+        return nonzero if self.rest is None else nonzero & self.rest.usable
 
     def solve(self, b: Float[Array, " n"]) -> Float[Array, " n"]:
         plan = self.plan

@@ -1,4 +1,4 @@
-"""What the step hooks have in common: what they carry from step to step, and the verdict on a step."""
+"""The state that all step hooks carry from step to step, and the decision whether a step is rejected."""
 
 import functools
 from typing import Any
@@ -56,8 +56,8 @@ def _distance(y0: Y, y1: Y, dtype: Any) -> FloatScalar:
 
 
 class HookState(eqx.Module):
-    """Carried from step to step: what the execution of steps remembers, the size of the first step
-    that was tried (the scale of time near t = 0), the totals, and how the last step went."""
+    """Carried from step to step: the memory of the execution, the size of the first step that was tried
+    (the scale of time near t = 0), the totals, and the result of the last step."""
 
     memory: Any
     first_step: FloatScalar
@@ -78,9 +78,9 @@ def conclude(
     bounds_error: bool,
     rejects: bool = True,
 ) -> tuple[Y, Y | None, dict[str, Any], HookState, RESULTS]:
-    """What a solver's `step` returns. A step that could not be corrected is to be rejected; with
-    `bounds_error` the error estimate is at least the size of the correction. Without a constraint
-    nothing is rejected here that the method keeps."""
+    """Return the results of a solver's `step`. A step that could not be corrected is rejected; with
+    `bounds_error` the error estimate is raised to the size of the correction. Without a constraint no
+    step is rejected here that the method itself accepts."""
     corrected = RESULTS.where(step.info.success, RESULTS.successful, nonlinear_failure())
     result, error = update_result(step.result, corrected), step.error
     if error is not None and rejects:
@@ -96,10 +96,11 @@ def conclude(
 
 
 def _at_least(error: Y, raw: Y, y1: Y, repeatable: BoolScalar) -> Y:
-    """The correction is a lower bound of the local error (Sudarsan & Keerthi 1998, 3.4).
+    """Raise an error estimate to the correction, a lower bound of the local error (Sudarsan & Keerthi
+    1998, 3.4).
 
-    Unless the step started off the manifold: then no step is small enough, and the smallest
-    one is let through.
+    Unless the step started off the manifold: then no step is small enough, and the smallest one is
+    accepted.
     """
 
     def raised(e: Array, a: Array, b: Array) -> Array:
