@@ -318,3 +318,14 @@ def test_the_loop_of_a_user():
     step = lambda z, a: z + 0.02 * DAE.terms.vf(0.0, z, a)
     end = lambda a: jax.lax.scan(lambda z, _: (step(z, a), None), Z, None, length=5)[0][2]
     assert check(end, AT) > 1e-6
+
+
+@pytest.mark.parametrize("wrap", [lambda f: f, jax.jit], ids=["eager", "jit"])
+@pytest.mark.parametrize("derivative", [lambda f: f, jax.grad, jax.hessian])
+def test_a_rule_around_operations_for_tracing_alone(derivative, wrap):
+    """`jnp.triu_indices` has some from JAX 0.12 on, which are replaced before a program is compiled."""
+    squares = lambda x: jnp.sum(jnp.outer(x, x)[jnp.triu_indices(3)] ** 2)
+    ruled = ForwardRule(squares)
+    ruled.define_jvp(lambda values, primals, tangents: jax.jvp(squares, primals, tangents)[1])
+    x = jnp.array([1.0, 2.0, 3.0])
+    np.testing.assert_allclose(wrap(derivative(ruled))(x), derivative(squares)(x), rtol=1e-14)

@@ -78,6 +78,15 @@ def _evaluate(*primals: Any, call_jaxpr: Any, rule: Callable) -> list:
     return jaxpr_as_fun(call_jaxpr)(*primals)
 
 
+def _evaluate_for_compiler(*primals: Any, call_jaxpr: Any, rule: Callable) -> list:
+    """From JAX 0.12 on: functions with operations that exist for tracing alone (`jnp.nonzero` has some)
+    are evaluated again for the compiler, after all derivatives were taken."""
+    return _evaluate(*primals, call_jaxpr=call_jaxpr, rule=rule)
+
+
+_ruled.to_lojax = _evaluate_for_compiler
+
+
 @_ruled.def_effectful_abstract_eval
 def _shapes(*primals: Any, call_jaxpr: Any, rule: Callable) -> tuple[list, Any]:
     del primals, rule
