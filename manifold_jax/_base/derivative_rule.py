@@ -78,13 +78,9 @@ def _evaluate(*primals: Any, call_jaxpr: Any, rule: Callable) -> list:
     return jaxpr_as_fun(call_jaxpr)(*primals)
 
 
-def _evaluate_for_compiler(*primals: Any, call_jaxpr: Any, rule: Callable) -> list:
-    """From JAX 0.12 on: functions with operations that exist for tracing alone (`jnp.nonzero` has some)
-    are evaluated again for the compiler, after all derivatives were taken."""
-    return _evaluate(*primals, call_jaxpr=call_jaxpr, rule=rule)
-
-
-_ruled.to_lojax = _evaluate_for_compiler
+# From JAX 0.12 on: functions with operations that exist for tracing alone (`jnp.nonzero` has some) are
+# evaluated again for the compiler, after all derivatives were taken.
+_ruled.to_lojax = _evaluate
 
 
 @_ruled.def_effectful_abstract_eval
