@@ -17,6 +17,7 @@ from jaxtyping import Array, Float
 
 from .._base.derivative_rule import ForwardRule
 from .._base.types import BoolScalar, FloatScalar
+from .elimination import eliminate, invert, rank_threshold
 
 
 # Number of operations grows like m^3 / 3: 170 at m = 8, still less than one library call.
@@ -44,36 +45,6 @@ class Factorization(eqx.Module):
             lambda _, b: self.factors.solve(b),
             lambda _, b: self.factors.solve_transposed(b),
         )
-
-
-class WrittenOut(eqx.Module):
-    """`A = L U` entry by entry, `L` with a unit diagonal below `U`."""
-
-    lu: list[list[FloatScalar]]
-
-    def solve(self, b: Float[Array, "m ..."]) -> Float[Array, "m ..."]:
-        lu, m = self.lu, len(self.lu)
-        x = [b[i] for i in range(m)]
-        for i in range(m):
-            for k in range(i):
-                x[i] = x[i] - lu[i][k] * x[k]
-        for i in reversed(range(m)):
-            for k in range(i + 1, m):
-                x[i] = x[i] - lu[i][k] * x[k]
-            x[i] = x[i] / lu[i][i]
-        return jnp.stack(x)
-
-    def solve_transposed(self, b: Float[Array, "m ..."]) -> Float[Array, "m ..."]:
-        lu, m = self.lu, len(self.lu)
-        x = [b[i] for i in range(m)]
-        for i in range(m):
-            for k in range(i):
-                x[i] = x[i] - lu[k][i] * x[k]
-            x[i] = x[i] / lu[i][i]
-        for i in reversed(range(m)):
-            for k in range(i + 1, m):
-                x[i] = x[i] - lu[k][i] * x[k]
-        return jnp.stack(x)
 
 
 class Library(eqx.Module):
@@ -117,17 +88,7 @@ def factorize_once(A: Float[Array, "m m"]) -> "Factorization | Inverse":
 
 @jax.custom_jvp
 def _invert(A: Float[Array, "m m"]) -> tuple[Float[Array, "m m"], BoolScalar]:
-    """Return the inverse, and whether the rank was full, as in [`factorize`][]."""
-    m = A.shape[0]
-    rows, diagonal = jnp.arange(m), jnp.abs(jnp.diagonal(A))
-    full_rank = jnp.asarray(True)
-    for k in range(m):
-        accepted = A[k, k] > rank_threshold(A) * diagonal[k]
-        full_rank &= accepted
-        row = jnp.where(rows == k, 1, A[k]) / jnp.where(accepted, A[k, k], 1)
-        others = jnp.where((rows == k)[None, :], 0, A) - A[:, k][:, None] * row[None, :]
-        A = jnp.where((rows == k)[:, None], row[None, :], others)
-    return A, full_rank
+    return invert(A)
 
 
 @_invert.defjvp  # pyright: ignore[reportArgumentType]
@@ -136,11 +97,6 @@ def _invert_jvp(primals, tangents):
     X, full_rank = _invert(A)
     no_tangent = np.zeros((), jax.dtypes.float0)
     return (X, full_rank), (-_product(_product(X, A_dot), X), no_tangent)
-
-
-def rank_threshold(A: Float[Array, "m m"]) -> float:
-    """Return the size that the pivots of an equilibrated matrix of full rank exceed."""
-    return 10 * A.shape[0] * float(jnp.finfo(A.dtype).eps)
 
 
 def _product(A: Float[Array, "i j"], B: Float[Array, "j ..."]) -> Float[Array, "i ..."]:
@@ -164,17 +120,7 @@ def factorize(A: Float[Array, "m m"]) -> Factorization:
     if m > UNROLL_LIMIT:
         pivots = jnp.diagonal(jsl.lu_factor(_equilibrated(A))[0])
         return _factorize_by_library(A, jnp.all(jnp.abs(pivots) > rank_threshold(A)))
-    lu = [[fixed[i, j] for j in range(m)] for i in range(m)]
-    full_rank = jnp.asarray(True)
-    for k in range(m):
-        accepted = lu[k][k] > rank_threshold(A) * jnp.abs(fixed[k, k])
-        full_rank &= accepted
-        lu[k][k] = jnp.where(accepted, lu[k][k], 1)
-        for i in range(k + 1, m):
-            lu[i][k] = lu[i][k] / lu[k][k]
-            for j in range(k + 1, m):
-                lu[i][j] = lu[i][j] - lu[i][k] * lu[k][j]
-    return Factorization(A, WrittenOut(lu), full_rank, _product)
+    return Factorization(A, *eliminate(fixed), _product)
 
 
 # Redundant equations depend on each other only nearly at a stage off the manifold: eigenvalues of `A`
