@@ -3,6 +3,7 @@
 from typing import Any
 
 import diffrax as dfx
+import equinox as eqx
 
 from .._base.compat import LoopState, Progress, with_result
 from .._base.rejection import result_of_state
@@ -16,7 +17,10 @@ class CheckedStartAdjoint(dfx.AbstractAdjoint):
     """
 
     adjoint: dfx.AbstractAdjoint
+    # Whether the user asked for the state of the solver, which is saved in any case.
+    keeps_solver_state: bool
 
-    def loop(self, *, init_state: LoopState, **kwargs: Any) -> Any:
-        result = result_of_state(Progress.of(init_state).y)
-        return self.adjoint.loop(init_state=with_result(init_state, result), **kwargs)
+    def loop(self, *, init_state: LoopState, saveat: dfx.SaveAt, **kwargs: Any) -> Any:
+        state = with_result(init_state, result_of_state(Progress.of(init_state).y))
+        saveat = eqx.tree_at(lambda s: s.solver_state, saveat, self.keeps_solver_state)
+        return self.adjoint.loop(init_state=state, saveat=saveat, **kwargs)

@@ -15,6 +15,7 @@ from .._base.closure import convert_closure
 from .._base.compat import Differentiable, LoopState, Progress
 from .._base.types import Args, RealScalarLike, Y
 from .._constraint.projection_info import ProjectionInfo
+from .._solver.base import AbstractManifoldSolver
 from .._solver.step.execution import execution_of, ExplicitStep
 from .._solver.step.frame import StepFrame
 from .._solver.step.hook_state import HookState
@@ -85,18 +86,31 @@ class Solve(NamedTuple):
     solver: dfx.AbstractSolver
     args: Args
     solver_state: Any  # that of the first step, for the parts that steps do not depend on
-    remembers: bool  # whether steps depend on the solver's state
+    remembers: bool  # whether steps begin with the memory of the step before
     jumps: bool  # whether steps may begin after jumps of the field
 
     @staticmethod
-    def of(terms: Any, solver: Any, args: Args, init_state: LoopState, controller: Any) -> "Solve":
+    def of(
+        terms: Any,
+        solver: Any,
+        args: Args,
+        init_state: LoopState,
+        controller: Any,
+        memory_is_used: bool,
+    ) -> "Solve":
+        """Describe a solve; `memory_is_used` says whether anything but the next step depends on the
+        memory after a step. If not, steps of explicit methods evaluate the field at their start again:
+        then the field at their end, which would be remembered, need not be differentiated."""
         begin = Progress.of(init_state)
-        # The step of a solver of Diffrax itself is written out, and then has no memory.
-        execution = execution_of(solver, terms, begin.tprev, begin.tnext, begin.y, args)
-        written_out = isinstance(execution, ExplicitStep)
+        example = begin.tprev, begin.tnext, begin.y, args
+        if isinstance(solver, AbstractManifoldSolver):
+            execution = solver.execution(solver.prepare_terms(terms), *example)
+            remembers = memory_is_used or not isinstance(execution, ExplicitStep)
+        else:  # the step of a solver of Diffrax itself is written out, and then has no memory
+            remembers = not isinstance(execution_of(solver, terms, *example), ExplicitStep)
         jumps = may_jump(controller, begin.made_jump)
         solver_state = lax.stop_gradient(begin.solver_state)
-        return Solve(terms, solver, args, solver_state, not written_out, jumps)
+        return Solve(terms, solver, args, solver_state, remembers, jumps)
 
     def state(self, loop_state: LoopState) -> State:
         now = Progress.of(loop_state)
@@ -107,7 +121,7 @@ class Solve(NamedTuple):
     ) -> tuple[State, Any]:
         """Return the state after a step, and the data of its interpolation."""
         terms, solver, args, y = self.terms, self.solver, self.args, state.y
-        if not self.remembers:
+        if not self.remembers and not isinstance(solver, AbstractManifoldSolver):
             unchanged = lambda y: (y, ProjectionInfo.of_nothing(y, jnp.asarray(True)))
             frame = StepFrame.of_state(y, terms, unchanged)
             step = ExplicitStep(solver).step(terms, frame, start, end, y, args, None, False)
@@ -116,7 +130,7 @@ class Solve(NamedTuple):
         y1, _, dense_info, solver_state, _ = solver.step(
             terms, start, end, y, args, solver_state, jumped
         )
-        return State(y1, memory_of(solver_state)), dense_info
+        return State(y1, memory_of(solver_state) if self.remembers else None), dense_info
 
 
 def subs_of(saveat: dfx.SaveAt) -> list[dfx.SubSaveAt]:

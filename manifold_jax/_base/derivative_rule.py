@@ -185,6 +185,8 @@ def _differentiate_linear(operands: Any, along: Any, **params: Any) -> tuple:
 def _transpose_linear(cotangents: Any, *operands: Any, **params: Any) -> list:
     k = params["num_primals"]
     given = [None if type(bar) is ad.Zero else bar for bar in cotangents]
+    if all(bar is None for bar in given):
+        return [None] * len(operands)
     return [None] * k + params["transpose"](list(operands[:k]), given)
 
 

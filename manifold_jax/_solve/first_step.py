@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array
 
+from .._base.known_value import known_value
 from .._base.types import BoolScalar, FloatScalar, Y
 from .setup import ProblemData
 
@@ -55,21 +56,22 @@ def first_step(
 
     def evaluate(at: tuple[Array, Y], _: None) -> tuple[tuple[Array, Y], tuple[Any, Y]]:
         t, y = at
-        field = terms.vf(t, y, args)
-        velocity = jax.lax.stop_gradient(terms.prod(field, jnp.ones((), t0.dtype)))
+        field = jax.lax.stop_gradient(terms.vf(t, y, args))
+        velocity = terms.prod(field, jnp.ones((), t0.dtype))
         step = direction * trial(velocity)[2]
         y = jtu.tree_map(lambda y, f: y + (step * f).astype(y.dtype), start, velocity)
         return (t0 + step, y), (field, velocity)
 
     # In a loop, so that the program contains one vector field instead of two.
-    _, (fields, velocities) = jax.lax.scan(evaluate, (t0, y0), None, length=2)
-    f0, f1 = (jtu.tree_map(lambda v, i=i: v[i], velocities) for i in (0, 1))
-    small, d1, h0 = trial(f0)
-    rate = norm(jtu.tree_map(jnp.subtract, f1, f0)) / h0 / d1
+    _, (fields, velocities) = jax.lax.scan(evaluate, (t0, start), None, length=2)
+    v0, v1 = (jtu.tree_map(lambda v, i=i: v[i], velocities) for i in (0, 1))
+    small, d1, h0 = trial(v0)
+    rate = norm(jtu.tree_map(jnp.subtract, v1, v0)) / h0 / d1
     power = 1 / (order + 1)  # pyright: ignore[reportOptionalOperand]
     h1 = (0.01 / d1) ** power * rate ** (-order * power)  # pyright: ignore[reportOptionalOperand]
     h = jnp.where(small, h0, jnp.minimum(100 * h0, h1))
     # A vector field that is not finite near the start gives no estimate.
     h = jnp.where(jnp.isfinite(h) & (h > 0), h, 1e-3 * span)
     h = jax.lax.stop_gradient(direction * jnp.minimum(h, span))
-    return FirstStep(h, jtu.tree_map(lambda f: f[0], fields))
+    first = jtu.tree_map(lambda f: f[0], fields)
+    return FirstStep(h, known_value(lambda t, y: terms.vf(t, y, args), first, t0, y0))

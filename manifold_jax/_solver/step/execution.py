@@ -84,7 +84,7 @@ class ExplicitStep(AbstractExecution):
 
     def step(self, terms, frame, t0, t1, y0, args, memory, made_jump) -> Step:
         evaluate = lambda: terms.vf(t0, y0, args)
-        f0 = evaluate() if memory is None else refreshed(made_jump, memory, evaluate)
+        f0 = None if memory is None else refreshed(made_jump, memory, evaluate)
         y1, w1, error, dense_info, f1, info = explicit_step(
             self._tableau, terms, frame, t0, t1, y0, args, f0, self.in_a_loop
         )

@@ -72,7 +72,7 @@ def explicit_step(
     f0: Any,
     in_a_loop: bool | None = None,
 ) -> ExplicitStepResult:
-    """Step from `y0`, with `f0` the vector field there, and correct the result.
+    """Step from `y0`, with `f0` the vector field there (None: evaluated here), and correct the result.
 
     `frame.terms` are evaluated at the stages, `terms` at states on the manifold. By default stages are
     evaluated in a loop if that is faster.
@@ -87,14 +87,19 @@ def explicit_step(
     rows = list(tableau.a_lower)
     # Not rounded beyond `t1`, where the field may jump.
     times = [jnp.asarray(t1 if c == 1 else t0 + float(c) * (t1 - t0)) for c in tableau.c]
-    w0, first = frame.origin, frame.pull_back(t0, frame.origin, y0, terms.prod(f0, control))
-    inner_rows = rows[:-1] if fsal else rows
+    w0, inner_rows = frame.origin, rows[:-1] if fsal else rows
     increment = lambda t, w: frame.terms.prod(at_stage(t, w), control)
     if in_a_loop is None:
         length = num_equations(at_stage, jnp.asarray(t0), w0)
         in_a_loop = length * (len(inner_rows) + 1) > LARGEST_UNROLLED and bool(inner_rows)
+    inner_times, first = times[: len(inner_rows)], None
+    if f0 is None and in_a_loop and frame.terms is terms:
+        inner_rows, inner_times = [np.zeros(0), *inner_rows], [jnp.asarray(t0), *inner_times]
+    else:
+        f0 = at_corrected(jnp.asarray(t0), y0) if f0 is None else f0
+        first = frame.pull_back(t0, w0, y0, terms.prod(f0, control))
     evaluate = _stages_in_a_loop if in_a_loop else _stages
-    increments = evaluate(inner_rows, times[: len(inner_rows)], increment, w0, first)
+    increments = evaluate(inner_rows, inner_times, increment, w0, first)
     # The last stage of a first-same-as-last method is evaluated at the corrected state.
     w1 = derivative_once(_combine(rows[-1] if fsal else tableau.b_sol, increments, w0), w0)
     y1, info = frame.correct(w1)
@@ -118,12 +123,17 @@ def _stages(rows: list[Any], times: list[Array], increment: Callable, w0: Y, fir
 
 
 def _stages_in_a_loop(
-    rows: list[Any], times: list[Array], increment: Callable, w0: Y, first: Y
+    rows: list[Any], times: list[Array], increment: Callable, w0: Y, first: Y | None
 ) -> list[Y]:
-    """Compute the same with the vector field compiled once, whatever the number of stages."""
-    count = len(rows) + 1
+    """Compute the same with the vector field compiled once, whatever the number of stages. Without
+    `first` the rows begin with that of the first stage."""
+    begin = 0 if first is None else 1
+    count = begin + len(rows)
     padded = [np.pad(np.asarray(row, np.float64), (0, count - len(row))) for row in rows]
-    buffer = jtu.tree_map(lambda k: jnp.zeros((count, *k.shape), k.dtype).at[0].set(k), first)
+    empty = lambda k: jnp.zeros((count, *k.shape), k.dtype)
+    buffer = jtu.tree_map(empty, w0 if first is None else first)
+    if first is not None:
+        buffer = jtu.tree_map(lambda b, k: b.at[0].set(k), buffer, first)
 
     def stage(buffer: Y, xs: Any) -> tuple[Y, None]:
         i, t, row = xs
@@ -131,7 +141,7 @@ def _stages_in_a_loop(
         new = increment(t, jtu.tree_map(sum_up, buffer, w0))
         return jtu.tree_map(lambda k, n: k.at[i].set(n), buffer, new), None
 
-    xs = jnp.arange(1, count), jnp.stack(times), jnp.asarray(np.stack(padded))
+    xs = jnp.arange(begin, count), jnp.stack(times), jnp.asarray(np.stack(padded))
     buffer, _ = jax.lax.scan(stage, buffer, xs)
     take = lambda i: jtu.tree_map(lambda k: k[i], buffer)
     return [take(i) for i in range(count)]
