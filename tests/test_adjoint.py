@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import manifold_jax as mj
+from manifold_jax._solver.step import explicit
 
 
 THETA = jnp.array([9.81, 1.1, 0.8])
@@ -431,6 +432,45 @@ def test_dense_solution_and_solver_state():
     reverse = jax.jit(jax.grad(lambda g: value(g, mj.StepReplayAdjoint())))(9.81)
     forward = jax.jit(jax.jacfwd(lambda g: value(g, dfx.ForwardMode())))(9.81)
     np.testing.assert_allclose(reverse, forward, rtol=1e-12)
+
+
+@pytest.mark.parametrize("in_a_loop", [False, True])
+@pytest.mark.parametrize("second", ["end", "times"])
+def test_a_solve_that_goes_on_from_the_state_of_a_solver(second, in_a_loop, monkeypatch):
+    """If only ends are saved, steps are made again from the state alone; the vector field that the
+    second solve gets is then known to depend on the same parameters."""
+    if in_a_loop:
+        monkeypatch.setattr(explicit, "LARGEST_UNROLLED", 0)
+    problem = mj.problems.pendulum()
+    solver = mj.Projected(dfx.Bosh3(), problem.constraint)
+
+    def value(parameters):
+        gravity, start = parameters
+        args = problem.args._replace(gravity=gravity)
+        controller = dfx.PIDController(rtol=1e-5, atol=1e-5)
+        options = dict(args=args, stepsize_controller=controller, max_steps=100)
+        y0 = jax.tree.map(jnp.asarray, problem.y0)
+        kept = dfx.SaveAt(t1=True, solver_state=True)
+        first = mj.diffeqsolve(problem.terms, solver, start, 1.0, None, y0, saveat=kept, **options)
+        saveat = dfx.SaveAt(t1=True) if second == "end" else dfx.SaveAt(ts=jnp.array([1.03, 1.5]))
+        sol = mj.diffeqsolve(
+            problem.terms,
+            solver,
+            1.0,
+            1.5,
+            0.05,
+            jax.tree.map(lambda y: y[-1], first.ys),
+            saveat=saveat,
+            solver_state=first.solver_state,
+            consistent="assume",
+            **options,
+        )
+        return sum(jnp.sum(jnp.sin(y)) for y in sol.ys)
+
+    at = jnp.array([9.81, 0.1])
+    reverse = jax.jit(jax.grad(value))(at)
+    forward = jax.jit(jax.jacfwd(value))(at)
+    np.testing.assert_allclose(reverse, forward, rtol=1e-11)
 
 
 def test_steps_across_jumps_of_the_field():

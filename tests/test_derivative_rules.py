@@ -14,6 +14,7 @@ import manifold_jax as mj
 from manifold_jax._applications.following import kernel
 from manifold_jax._base.closure import convert_closure
 from manifold_jax._base.derivative_rule import ForwardRule
+from manifold_jax._base.known_value import known_value
 from manifold_jax._linalg.dense import factorize, factorize_once, pseudo_invert
 from manifold_jax._linalg.newton import root_of_step
 from manifold_jax._linalg.pivoted import (
@@ -53,6 +54,11 @@ def pseudo_inverse(a):
 def cube_root(a):
     step = convert_closure(lambda x: -(x**3 - a) / (3 * x**2), a)
     return root_of_step(step, jax.lax.stop_gradient(a) ** (1 / 3)) ** 2
+
+
+def known(a):
+    f = lambda x: jnp.sin(a * x) * x
+    return known_value(f, f(vector(a, 3)), vector(a, 3))
 
 
 def planar(t, q, a):
@@ -105,6 +111,7 @@ POINT = jnp.array([0.7, 0.5, 0.6])
 
 RULES = {
     "elimination without exchanges": solved(factorize, 3),
+    "elimination in loops": solved(factorize, 7),
     "of the library": solved(factorize, 10),
     "inverse": solved(factorize_once, 4),
     "elimination with exchanges": solved(factorize_by_reduction, 4),
@@ -114,6 +121,7 @@ RULES = {
     "pseudo-inverse": pseudo_inverse,
     "derivative_once": lambda a: total(derivative_once(vector(a, 3) ** 2, vector(a, 3))),
     "root of a step": cube_root,
+    "known value": lambda a: total(known(a)),
     "tangent of a curve": lambda a: total(kernel(matrix(a, 3)[:2])),
     "correction": corrected(CURVED, POINT, False),
     "consistent state": corrected(CURVED, POINT, True),
@@ -329,3 +337,15 @@ def test_a_rule_around_operations_for_tracing_alone(derivative, wrap):
     ruled.define_jvp(lambda values, primals, tangents: jax.jvp(squares, primals, tangents)[1])
     x = jnp.array([1.0, 2.0, 3.0])
     np.testing.assert_allclose(wrap(derivative(ruled))(x), derivative(squares)(x), rtol=1e-14)
+
+
+def test_nothing_is_compiled_for_a_known_value_without_effect():
+    """Only the value reaches the program, not the function, which is there for its derivative."""
+
+    def value(a, is_used):
+        square, known = jax.jit(lambda a: (a**2, known_value(jnp.sin, jnp.asarray(0.25), a)))(a)
+        return square + known if is_used else square
+
+    derivative = lambda is_used: str(jax.make_jaxpr(jax.grad(lambda a: value(a, is_used)))(0.3))
+    assert "cos" in derivative(True)
+    assert "cos" not in derivative(False)

@@ -129,7 +129,9 @@ class StepReplayAdjoint(dfx.AbstractAdjoint):
 
         twice = _with_loops(solver, "bounded")
         interpolates = saveat.dense or event is not None
-        memory_is_used = interpolates or saveat.solver_state or any(ts is not None for ts in times[2])
+        memory_is_used = (
+            interpolates or saveat.solver_state or any(ts is not None for ts in times[2])
+        )
         solve = Solve.of(terms, twice, args, init_state, stepsize_controller, memory_is_used)
         start = solve.state(init_state)
         replay = Replay.build(solve, saveat, t0, start, interpolates)

@@ -1,8 +1,4 @@
-"""Gaussian elimination of small matrices without row exchanges, a column at a time.
-
-In loops over columns, which compile in half the time of the same operations written out, and run in
-about the same: entry by entry, the field of a four-bar linkage (8 equations) has 56 more kernels.
-"""
+"""Gaussian elimination of small matrices without row exchanges, written out or in loops over columns."""
 
 from collections.abc import Callable
 from typing import Any
@@ -16,8 +12,10 @@ from jaxtyping import Array, Float
 from .._base.types import BoolScalar, FloatScalar
 
 
-# Largest number of columns for which operations are written out entry by entry, so that XLA fuses them
-# with what is around.
+# Largest number of columns for which factors are computed entry by entry. At 8 (four-bar linkage) a loop
+# compiles in 0.8 of the time and runs in 1.25 (jaxlib 0.12.0.1) and 0.65 times (0.10.2) of it; at 6
+# (chain of six links) in 0.95, and 1.15. Inverses are always computed in a loop: 0.7 of the time to
+# compile the gradient of a four-bar linkage, which runs in 0.85 of it.
 LARGEST_WRITTEN_OUT = 6
 
 
@@ -144,7 +142,9 @@ def _substitute_back(
     return _loop(M.shape[0], column, b)
 
 
-def _subtracted(x: Array, k: Any, column: Float[Array, " m"], diagonal: Float[Array, " m"]) -> Array:
+def _subtracted(
+    x: Array, k: Any, column: Float[Array, " m"], diagonal: Float[Array, " m"]
+) -> Array:
     """Return `x` with unknown `k` in its place, and its column subtracted from the other equations."""
     along = lambda v: v.reshape(len(v), *(1,) * (x.ndim - 1))
     found = x[k] / diagonal[k]
