@@ -13,7 +13,7 @@ from variants import variants
 import manifold_jax as mj
 from manifold_jax._applications.following import kernel
 from manifold_jax._base.closure import convert_closure
-from manifold_jax._base.derivative_rule import ForwardRule
+from manifold_jax._base.derivative_rule import apply_linear, ForwardRule
 from manifold_jax._base.known_value import known_value
 from manifold_jax._linalg.dense import factorize, factorize_once, pseudo_invert
 from manifold_jax._linalg.newton import root_of_step
@@ -339,12 +339,23 @@ def test_a_rule_around_operations_for_tracing_alone(derivative, wrap):
     np.testing.assert_allclose(wrap(derivative(ruled))(x), derivative(squares)(x), rtol=1e-14)
 
 
+@ForwardRule
+def without_cotangents(x):
+    return x
+
+
+@without_cotangents.define_jvp
+def _(value, primals, tangents):
+    forward = lambda primals, tangents: jnp.zeros_like(value)
+    return apply_linear(forward, lambda primals, bar: (None,), value, primals, tangents)
+
+
 def test_nothing_is_compiled_for_a_known_value_without_effect():
-    """Only the value reaches the program, not the function, which is there for its derivative."""
+    """The function is there for its derivative only, and that for cotangents only."""
 
     def value(a, is_used):
-        square, known = jax.jit(lambda a: (a**2, known_value(jnp.sin, jnp.asarray(0.25), a)))(a)
-        return square + known if is_used else square
+        known = known_value(jnp.sin, jnp.asarray(0.25), a)
+        return a**2 + (known if is_used else without_cotangents(known))
 
     derivative = lambda is_used: str(jax.make_jaxpr(jax.grad(lambda a: value(a, is_used)))(0.3))
     assert "cos" in derivative(True)
