@@ -37,6 +37,7 @@ SMALLEST = {
         sizes="4", lanes=2, repeats=1, problems="lorenz", precisions="double"
     ),
     "benchmarks.speed.closed_forms": dict(repeats=1),
+    "benchmarks.speed.compile_profile": dict(problem="pendulum", plain=True),
     "benchmarks.speed.compile_time": dict(compilations=1, repeats=1, only="pendulum"),
     "benchmarks.speed.devices": dict(size=4, repeats=1),
     "benchmarks.speed.ensemble": dict(

@@ -49,7 +49,7 @@ class WrittenOut(eqx.Module):
         return jnp.stack(x)
 
 
-class Eliminated(eqx.Module):
+class TriangularFactors(eqx.Module):
     """`A = L U` in one array: `U` on and above the diagonal, below it `L`, whose diagonal is one."""
 
     lu: Float[Array, "m m"]
@@ -63,7 +63,7 @@ class Eliminated(eqx.Module):
         return _substitute_back(self.lu.T, _substitute(self.lu.T, b, jnp.diagonal(self.lu)), one)
 
 
-def eliminate(A: Float[Array, "m m"]) -> tuple[Eliminated | WrittenOut, BoolScalar]:
+def eliminate(A: Float[Array, "m m"]) -> tuple[TriangularFactors | WrittenOut, BoolScalar]:
     """Return the factors, and whether every pivot exceeds `rank_threshold` times its diagonal entry.
     Others are replaced by one."""
     return (_write_out if A.shape[0] <= LARGEST_WRITTEN_OUT else _eliminate)(A)
@@ -83,7 +83,7 @@ def _write_out(A: Float[Array, "m m"]) -> tuple[WrittenOut, BoolScalar]:
     return WrittenOut(lu), full_rank
 
 
-def _eliminate(A: Float[Array, "m m"]) -> tuple[Eliminated, BoolScalar]:
+def _eliminate(A: Float[Array, "m m"]) -> tuple[TriangularFactors, BoolScalar]:
     rows, smallest = np.arange(A.shape[0]), rank_threshold(A) * jnp.abs(jnp.diagonal(A))
 
     def column(k: Any, state: tuple[Array, BoolScalar]) -> tuple[Array, BoolScalar]:
@@ -97,7 +97,7 @@ def _eliminate(A: Float[Array, "m m"]) -> tuple[Eliminated, BoolScalar]:
         return jnp.where((rows == k)[None, :], new[:, None], rest), full_rank & accepted
 
     lu, full_rank = _loop(A.shape[0], column, (A, jnp.asarray(True)))
-    return Eliminated(lu), full_rank
+    return TriangularFactors(lu), full_rank
 
 
 def invert(A: Float[Array, "m m"]) -> tuple[Float[Array, "m m"], BoolScalar]:

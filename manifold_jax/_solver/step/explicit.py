@@ -84,22 +84,24 @@ def explicit_step(
     if frame.terms is terms:
         at_stage = at_corrected
     fsal = is_first_same_as_last(tableau)
-    rows = list(tableau.a_lower)
+    rows, w0 = list(tableau.a_lower), frame.origin
     # Not rounded beyond `t1`, where the field may jump.
     times = [jnp.asarray(t1 if c == 1 else t0 + float(c) * (t1 - t0)) for c in tableau.c]
-    w0, inner_rows = frame.origin, rows[:-1] if fsal else rows
+    inner = (rows[:-1], times[:-1]) if fsal else (rows, times)
     increment = lambda t, w: frame.terms.prod(at_stage(t, w), control)
+
+    def first_increment() -> Y:
+        field = at_corrected(jnp.asarray(t0), y0) if f0 is None else f0
+        return frame.pull_back(t0, w0, y0, terms.prod(field, control))
+
+    first = None if f0 is None and frame.terms is terms else first_increment()
     if in_a_loop is None:
         length = num_equations(at_stage, jnp.asarray(t0), w0)
-        in_a_loop = length * (len(inner_rows) + 1) > LARGEST_UNROLLED and bool(inner_rows)
-    inner_times, first = times[: len(inner_rows)], None
-    if f0 is None and in_a_loop and frame.terms is terms:
-        inner_rows, inner_times = [np.zeros(0), *inner_rows], [jnp.asarray(t0), *inner_times]
+        in_a_loop = length * (len(inner[0]) + 1) > LARGEST_UNROLLED and bool(inner[0])
+    if in_a_loop:
+        increments = _stages_in_a_loop(*inner, increment, w0, first, jnp.asarray(t0))
     else:
-        f0 = at_corrected(jnp.asarray(t0), y0) if f0 is None else f0
-        first = frame.pull_back(t0, w0, y0, terms.prod(f0, control))
-    evaluate = _stages_in_a_loop if in_a_loop else _stages
-    increments = evaluate(inner_rows, inner_times, increment, w0, first)
+        increments = _stages(*inner, increment, w0, first_increment() if first is None else first)
     # The last stage of a first-same-as-last method is evaluated at the corrected state.
     w1 = derivative_once(_combine(rows[-1] if fsal else tableau.b_sol, increments, w0), w0)
     y1, info = frame.correct(w1)
@@ -123,17 +125,16 @@ def _stages(rows: list[Any], times: list[Array], increment: Callable, w0: Y, fir
 
 
 def _stages_in_a_loop(
-    rows: list[Any], times: list[Array], increment: Callable, w0: Y, first: Y | None
+    rows: list[Any], times: list[Array], increment: Callable, w0: Y, first: Y | None, t0: Array
 ) -> list[Y]:
-    """Compute the same with the vector field compiled once, whatever the number of stages. Without
-    `first` the rows begin with that of the first stage."""
-    begin = 0 if first is None else 1
-    count = begin + len(rows)
-    padded = [np.pad(np.asarray(row, np.float64), (0, count - len(row))) for row in rows]
+    """Compute the same with the vector field compiled once, whatever the number of stages. The first
+    increment is computed in the loop, too, unless it is known."""
+    count = len(rows) + 1
+    padded = [np.pad(np.asarray(row, np.float64), (0, count - len(row))) for row in ([], *rows)]
     empty = lambda k: jnp.zeros((count, *k.shape), k.dtype)
-    buffer = jtu.tree_map(empty, w0 if first is None else first)
+    buffer, begin = jtu.tree_map(empty, w0 if first is None else first), 0
     if first is not None:
-        buffer = jtu.tree_map(lambda b, k: b.at[0].set(k), buffer, first)
+        buffer, begin = jtu.tree_map(lambda b, k: b.at[0].set(k), buffer, first), 1
 
     def stage(buffer: Y, xs: Any) -> tuple[Y, None]:
         i, t, row = xs
@@ -141,7 +142,8 @@ def _stages_in_a_loop(
         new = increment(t, jtu.tree_map(sum_up, buffer, w0))
         return jtu.tree_map(lambda k, n: k.at[i].set(n), buffer, new), None
 
-    xs = jnp.arange(begin, count), jnp.stack(times), jnp.asarray(np.stack(padded))
+    at, weights = jnp.stack([t0, *times]), jnp.asarray(np.stack(padded))
+    xs = jnp.arange(begin, count), at[begin:], weights[begin:]
     buffer, _ = jax.lax.scan(stage, buffer, xs)
     take = lambda i: jtu.tree_map(lambda k: k[i], buffer)
     return [take(i) for i in range(count)]
