@@ -463,7 +463,7 @@ def test_a_solve_that_goes_on_from_the_state_of_a_solver(second, in_a_loop, monk
             saveat=saveat,
             solver_state=first.solver_state,
             consistent="assume",
-            **options,
+            **{**options, "args": args._replace(gravity=2 * gravity)},
         )
         return sum(jnp.sum(jnp.sin(y)) for y in sol.ys)
 

@@ -17,10 +17,12 @@ class CheckedStartAdjoint(dfx.AbstractAdjoint):
     """
 
     adjoint: dfx.AbstractAdjoint
-    # Whether the user asked for the state of the solver, which is saved in any case.
+    # Whether the user passed or asked for the state of the solver, which in any case is passed and saved.
+    passes_solver_state: bool
     keeps_solver_state: bool
 
     def loop(self, *, init_state: LoopState, saveat: dfx.SaveAt, **kwargs: Any) -> Any:
         state = with_result(init_state, result_of_state(Progress.of(init_state).y))
         saveat = eqx.tree_at(lambda s: s.solver_state, saveat, self.keeps_solver_state)
+        kwargs["passed_solver_state"] = self.passes_solver_state
         return self.adjoint.loop(init_state=state, saveat=saveat, **kwargs)

@@ -99,8 +99,9 @@ class Solve(NamedTuple):
         memory_is_used: bool,
     ) -> "Solve":
         """Describe a solve; `memory_is_used` says whether anything but the next step depends on the
-        memory after a step. If not, steps of explicit methods evaluate the field at their start again:
-        then the field at their end, which would be remembered, need not be differentiated."""
+        memory after a step, or the first step on a memory from elsewhere. If not, steps of explicit
+        methods evaluate the field at their start again: then the field at their end, which would be
+        remembered, need not be differentiated."""
         begin = Progress.of(init_state)
         example = begin.tprev, begin.tnext, begin.y, args
         if isinstance(solver, AbstractManifoldSolver):

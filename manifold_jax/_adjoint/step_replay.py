@@ -98,6 +98,7 @@ class StepReplayAdjoint(dfx.AbstractAdjoint):
         max_steps,
         event,
         init_state,
+        passed_solver_state,
         progress_meter,
         **_: Any,
     ) -> Any:
@@ -129,9 +130,8 @@ class StepReplayAdjoint(dfx.AbstractAdjoint):
 
         twice = _with_loops(solver, "bounded")
         interpolates = saveat.dense or event is not None
-        memory_is_used = (
-            interpolates or saveat.solver_state or any(ts is not None for ts in times[2])
-        )
+        is_interpolated = interpolates or any(ts is not None for ts in times[2])
+        memory_is_used = is_interpolated or saveat.solver_state or passed_solver_state
         solve = Solve.of(terms, twice, args, init_state, stepsize_controller, memory_is_used)
         start = solve.state(init_state)
         replay = Replay.build(solve, saveat, t0, start, interpolates)

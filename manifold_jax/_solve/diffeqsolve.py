@@ -118,7 +118,7 @@ def diffeqsolve(
     setup = Setup(terms, solver, dt0, saveat, stepsize_controller, consistent, throw, event)
     ready = prepare(setup, ProblemData(t0, t1, y0, args))
     t0, t1, y0, _ = ready.data
-    adjoint = CheckedStartAdjoint(adjoint, saveat.solver_state)
+    adjoint = CheckedStartAdjoint(adjoint, solver_state is not None, saveat.solver_state)
     if event is not None and event.root_finder is not None:
         adjoint = LocatingAdjoint(adjoint)
     sol = dfx.diffeqsolve(
