@@ -529,7 +529,8 @@ def test_network_as_vector_field():
 
 @pytest.mark.slow
 def test_memory_does_not_grow_with_the_states():
-    """Compiled, the room for states is `checkpoints` and one block, whatever `max_steps`."""
+    """Compiled, the room for states is `checkpoints` and one block, whatever `max_steps`. Of a state at
+    the end no vector field is recorded."""
 
     def bytes_needed(max_steps, checkpoints):
         adjoint = mj.StepReplayAdjoint(checkpoints=checkpoints)
@@ -544,6 +545,6 @@ def test_memory_does_not_grow_with_the_states():
         )
 
     few, many = bytes_needed(2**14, 128), bytes_needed(2**14, 2**14)
-    times, state = 3 * 8 * 2**14, 4 * 8  # and whether they were accepted
+    times, state = 3 * 8 * 2**14, 2 * 8  # and whether they were accepted
     assert few < times + 2 * 2 * 128 * state + 50_000
     assert many > times + 2**14 * state
