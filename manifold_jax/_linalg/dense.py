@@ -86,9 +86,7 @@ def factorize_once(A: Float[Array, "m m"]) -> "Factorization | Inverse":
     return Inverse(*_invert(A), _product)
 
 
-@jax.custom_jvp
-def _invert(A: Float[Array, "m m"]) -> tuple[Float[Array, "m m"], BoolScalar]:
-    return invert(A)
+_invert = jax.custom_jvp(invert)
 
 
 @_invert.defjvp  # pyright: ignore[reportArgumentType]

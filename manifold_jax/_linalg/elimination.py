@@ -1,4 +1,7 @@
-"""Gaussian elimination of small matrices without row exchanges, written out or in loops over columns."""
+"""Gaussian elimination of small matrices without row exchanges, written out or in loops over columns.
+
+Source: Golub & Van Loan, Matrix Computations (2013), sections 3.1 and 3.2.
+"""
 
 from collections.abc import Callable
 from typing import Any
