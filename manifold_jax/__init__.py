@@ -34,6 +34,8 @@ from ._mechanics import (
     MechanicalSystem as MechanicalSystem,
     VelocityStabilization as VelocityStabilization,
 )
+from ._resets.record import Resets as Resets
+from ._resets.reset import Reset as Reset, ResetAt as ResetAt
 from ._rosenbrock import MassMatrixTerm as MassMatrixTerm, Rodas3P as Rodas3P, Rodas5P as Rodas5P
 from ._solve.diffeqsolve import diffeqsolve as diffeqsolve
 from ._solver import (

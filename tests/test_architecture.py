@@ -23,6 +23,7 @@ LAYERS = [
     {"_rosenbrock"},
     {"_solver.step"},
     {"_solver"},
+    {"_resets"},
     {"_adjoint"},
     {"_solve"},
     {"_mechanics"},

@@ -24,6 +24,7 @@ from .._base.compat import (
 )
 from .._base.types import BoolScalar, FloatScalar, IntScalar, Y
 from .._linalg.newton import root_of_step
+from .._resets.solver import Resetting
 from .._solver.base import AbstractManifoldSolver
 
 
@@ -67,7 +68,9 @@ class _EventsInStep:
         self.after = [jnp.asarray(v) for v in jtu.tree_leaves(step.values)]
         self.mask = jnp.stack(jtu.tree_leaves(step.mask))
         self.happened = jnp.any(self.mask)
-        self.start = lax.stop_gradient(step.start)
+        self.start = step.start
+        if not isinstance(given["solver"], Resetting):  # the step may begin at an event
+            self.start = lax.stop_gradient(step.start)
         self.end = lax.stop_gradient(step.end)
         self.interpolation = given["solver"].interpolation_cls(
             t0=self.start, t1=self.end, **step.dense_info

@@ -4,12 +4,14 @@ except for the end of the solve."""
 from typing import Any
 
 import diffrax as dfx
+import equinox as eqx
 import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 
 from .._base.compat import LoopState, Progress, with_next_time
 from .._linalg.newton import without_derivative
+from .._resets.controller import ResettingController
 
 
 class SizesHeldFixed(dfx.AbstractStepSizeController):
@@ -29,6 +31,15 @@ class SizesHeldFixed(dfx.AbstractStepSizeController):
         # A step begins at the end of the one before, which may be the end of the solve.
         ends = jnp.where(next_t0 == fixed[1], t1, jnp.where(next_t0 == fixed[0], t0, next_t0))
         return keep, ends, next_t1, jump, state, result
+
+
+def with_sizes_held_fixed(
+    controller: dfx.AbstractStepSizeController,
+) -> dfx.AbstractStepSizeController:
+    """Return a controller whose step sizes have no derivatives; the times of events have."""
+    if isinstance(controller, ResettingController):
+        return eqx.tree_at(lambda c: c.controller, controller, SizesHeldFixed(controller.controller))
+    return SizesHeldFixed(controller)
 
 
 def with_end_held_fixed(state: LoopState, t1: Any) -> LoopState:

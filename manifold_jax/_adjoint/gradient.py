@@ -4,7 +4,7 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from .._base.types import FloatScalar, IntScalar, Y
 from .record import Vectors
@@ -28,6 +28,7 @@ class RecordedStep(NamedTuple):
     start: Float[Array, "*steps"]
     end: Float[Array, "*steps"]
     jumped: Bool[Array, "*steps"] | None  # None if no steps begin after jumps
+    reset: Int[Array, "*steps"] | None  # which reset is at its end, or -1; None without resets
     accepted: Bool[Array, "*steps"]
     state: Vectors  # from which the step was made
 
@@ -70,6 +71,14 @@ class Gradient(NamedTuple):
     state: State
     leaves: Any
     times: TimesBar | None  # None if they have no derivatives
+    # With resets, of the time at which that step ends and the next one begins, which may be that of an
+    # event; and the number of resets that are still to come.
+    start: FloatScalar | None
+    resets: IntScalar | None
+
+    @property
+    def is_timed(self) -> bool:
+        return self.times is not None or self.start is not None
 
 
 def add(a: Any, b: Any) -> Any:

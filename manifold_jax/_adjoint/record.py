@@ -13,6 +13,7 @@ from jaxtyping import Array, Float
 
 from .._base.compat import buffer_at_set, MaybeBuffer, Progress, unvmap_max, while_loop
 from .._base.types import IntScalar
+from .._resets.controller import state_of_resets
 
 
 # Blocks have `_FEWEST` steps if their states then take at most `_SMALL` bytes: XLA for CPUs runs the
@@ -105,21 +106,31 @@ class Record(eqx.Module):
 
     @staticmethod
     def empty(
-        state: Any, time_dtype: Any, max_steps: int, checkpoints: int | None, jumps: bool
+        state: Any,
+        time_dtype: Any,
+        max_steps: int,
+        checkpoints: int | None,
+        columns: int,
     ) -> "Record":
+        """Return a record without steps. Its columns are the start and the end of a step, whether it begins
+        after a jump of the field, and which reset is at its end; the last two only where they are used."""
         packing = Packing.of(state)
         sizes = Sizes.of(packing.nbytes, max_steps, checkpoints)
         x = packing.pack(state)
         room = lambda rows, v: jnp.zeros((*rows, v.size), v.dtype)
         segments = 0 if sizes.kept == sizes.blocks else sizes.blocks // sizes.segment
         kept = {k: room((sizes.kept, sizes.block), v) for k, v in x.items() if sizes.kept}
-        times = jnp.full((sizes.blocks, sizes.block, 3 if jumps else 2), -jnp.inf, time_dtype)
+        times = jnp.full((sizes.blocks, sizes.block, columns), -jnp.inf, time_dtype)
         firsts = {k: room((segments,), v) for k, v in x.items() if segments}
         return Record(times, kept, firsts, packing, sizes)
 
     @property
     def jumps(self) -> bool:
-        return self.times.shape[2] == 3
+        return self.times.shape[2] >= 3
+
+    @property
+    def resets(self) -> bool:
+        return self.times.shape[2] == 4
 
     def including(self, i: IntScalar, row: Float[Array, " columns"], x: Vectors) -> "Record":
         """Return the record with step number `i`, made from `x`."""
@@ -164,10 +175,16 @@ def recording(record: Record, of: Callable[[Any], Any], run: Callable) -> tuple[
         def step(carry):
             state, record = carry
             new, now = body_fun(state), Progress.of(state)
-            accepted = Progress.of(new).num_accepted_steps > now.num_accepted_steps
+            end = Progress.of(new)
+            accepted = end.num_accepted_steps > now.num_accepted_steps
             row = [now.tprev, jnp.where(accepted, now.tnext, -jnp.inf)]
             if record.jumps:
                 row.append(jnp.asarray(now.made_jump, now.tprev.dtype))
+            if record.resets:
+                before, after = (state_of_resets(p.controller_state).record for p in (now, end))
+                which = after.indices[jnp.minimum(before.number, after.indices.size - 1)]
+                which = jnp.where(after.number > before.number, which, -1)
+                row.append(which.astype(now.tprev.dtype))
             x = record.packing.pack(of(state))
             return new, record.including(unvmap_max(now.num_steps), jnp.stack(row), x)
 

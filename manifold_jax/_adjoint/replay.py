@@ -12,9 +12,11 @@ import jax.tree_util as jtu
 from jaxtyping import Array
 
 from .._base.closure import convert_closure
-from .._base.compat import Differentiable, LoopState, Progress
-from .._base.types import Args, RealScalarLike, Y
+from .._base.compat import Differentiable, LoopState, Progress, start_of_last, with_resets_put
+from .._base.types import Args, FloatScalar, IntScalar, RealScalarLike, Y
 from .._constraint.projection_info import ProjectionInfo
+from .._resets.controller import state_of_resets
+from .._resets.solver import ResetState, Resetting
 from .._solver.base import AbstractManifoldSolver
 from .._solver.step.execution import execution_of, ExplicitStep
 from .._solver.step.frame import StepFrame
@@ -26,6 +28,21 @@ class State(NamedTuple):
 
     y: Y
     memory: Any
+
+
+class ResetOutputs(NamedTuple):
+    """The times of resets and the states before and after them; where the last step begins, with events."""
+
+    rows: Any
+    last_start: FloatScalar | None
+
+
+class Event(NamedTuple):
+    """The time of an event, which has a derivative, and the states before and after it."""
+
+    time: FloatScalar
+    before: Y
+    after: Y
 
 
 class Saving(eqx.Module):
@@ -42,7 +59,7 @@ class Saving(eqx.Module):
 class Replay(eqx.Module):
     """A solve as functions of single steps, pytrees whose leaves are the arrays that they close over."""
 
-    step: Callable  # (start, end, jumped, state) -> next state, dense_info or None
+    step: Callable  # (start, end, jumped, reset, state) -> next state, dense_info or None, event or None
     savings: list[Saving]
 
     @staticmethod
@@ -51,13 +68,16 @@ class Replay(eqx.Module):
         subs = subs_of(saveat)
         interpolates = dense or any(sub.ts is not None for sub in subs)
 
-        def step(start, end, jumped, state):
-            after, dense_info = solve.attempt(start, end, jumped, state)
-            return after, dense_info if interpolates else None
+        def step(start, end, jumped, reset, state):
+            after, dense_info, event = solve.attempt(start, end, jumped, reset, state)
+            return after, dense_info if interpolates else None, event
 
-        example = t, t, t != t if solve.jumps else False, start
+        jumped, reset = t != t if solve.jumps else False, None
+        if solve.resetting is not None:
+            reset = jnp.zeros((), jnp.int32)
+        example = t, t, jumped, reset, start
         step = convert_closure(step, *example)
-        _, dense_info = eqx.filter_eval_shape(step, *example)
+        _, dense_info, _ = eqx.filter_eval_shape(step, *example)
 
         def saving(sub: dfx.SubSaveAt) -> Saving:
             def at_state(t, y):
@@ -88,6 +108,7 @@ class Solve(NamedTuple):
     solver_state: Any  # that of the first step, for the parts that steps do not depend on
     remembers: bool  # whether steps begin with the memory of the step before
     jumps: bool  # whether steps may begin after jumps of the field
+    resetting: Resetting | None = None  # if the state may jump at events
 
     @staticmethod
     def of(
@@ -102,7 +123,9 @@ class Solve(NamedTuple):
         memory after a step, or the first step on a memory from elsewhere. If not, steps of explicit
         methods evaluate the field at their start again: then the field at their end, which would be
         remembered, need not be differentiated."""
-        begin = Progress.of(init_state)
+        begin, resetting = Progress.of(init_state), None
+        if isinstance(solver, Resetting):
+            resetting, solver = solver, solver.inner
         example = begin.tprev, begin.tnext, begin.y, args
         if isinstance(solver, AbstractManifoldSolver):
             execution = solver.execution(solver.prepare_terms(terms), *example)
@@ -111,16 +134,30 @@ class Solve(NamedTuple):
             remembers = not isinstance(execution_of(solver, terms, *example), ExplicitStep)
         jumps = may_jump(controller, begin.made_jump)
         solver_state = lax.stop_gradient(begin.solver_state)
-        return Solve(terms, solver, args, solver_state, remembers, jumps)
+        if isinstance(solver_state, ResetState):
+            solver_state = solver_state.inner
+        return Solve(terms, solver, args, solver_state, remembers, jumps, resetting)
 
     def state(self, loop_state: LoopState) -> State:
         now = Progress.of(loop_state)
         return State(now.y, memory_of(now.solver_state) if self.remembers else None)
 
     def attempt(
+        self, start: Any, end: Any, jumped: Any, reset: IntScalar | None, state: State
+    ) -> tuple[State, Any, Event | None]:
+        """Return the state after a step and after the reset at its end, if there is one (of this number,
+        otherwise -1), the data of its interpolation, and the event."""
+        after, dense_info = self._attempt(start, end, jumped, state)
+        if self.resetting is None or reset is None:
+            return after, dense_info, None
+        y = self.resetting.end_of_step(start, end, state.y, after.y)
+        number = jnp.maximum(reset, 0)
+        jump = self.resetting.jump(self.terms, reset >= 0, number, end, end, y)
+        return State(jump.after, after.memory), dense_info, Event(jump.time, jump.before, jump.after)
+
+    def _attempt(
         self, start: RealScalarLike, end: RealScalarLike, jumped: Any, state: State
     ) -> tuple[State, Any]:
-        """Return the state after a step, and the data of its interpolation."""
         terms, solver, args, y = self.terms, self.solver, self.args, state.y
         if not self.remembers and not isinstance(solver, AbstractManifoldSolver):
             unchanged = lambda y: (y, ProjectionInfo.of_nothing(y, jnp.asarray(True)))
@@ -140,10 +177,14 @@ def subs_of(saveat: dfx.SaveAt) -> list[dfx.SubSaveAt]:
 
 def memory_of(solver_state: Any) -> Any:
     """Return the memory of a hook without its statistics, which no step depends on."""
+    if isinstance(solver_state, ResetState):
+        return memory_of(solver_state.inner)
     return solver_state.memory if isinstance(solver_state, HookState) else solver_state
 
 
 def with_memory(solver_state: Any, memory: Any) -> Any:
+    if isinstance(solver_state, ResetState):
+        return dataclasses.replace(solver_state, inner=with_memory(solver_state.inner, memory))
     if isinstance(solver_state, HookState):
         return dataclasses.replace(solver_state, memory=memory)
     return memory
@@ -163,11 +204,20 @@ def may_jump(controller: Any, made_jump: Any) -> bool:
 def outputs_of(final_state: LoopState, remembers: bool) -> Differentiable:
     """Return the differentiable part of a final state; of the solver's state, what steps depend on."""
     found = Differentiable.of(final_state)
-    return found._replace(solver_state=memory_of(found.solver_state) if remembers else None)
+    memory = memory_of(found.solver_state) if remembers else None
+    resets = state_of_resets(Progress.of(final_state).controller_state)
+    if resets is not None:
+        found = found._replace(resets=ResetOutputs(resets.record.rows, start_of_last(final_state)))
+    return found._replace(solver_state=memory)
 
 
 def with_outputs(final_state: LoopState, outputs: Differentiable) -> LoopState:
     given = Differentiable.of(final_state).solver_state
     memory = outputs.solver_state
     solver_state = given if memory is None else with_memory(given, memory)
-    return outputs._replace(solver_state=solver_state).put_into(final_state)
+    new = outputs._replace(solver_state=solver_state).put_into(final_state)
+    resets = state_of_resets(Progress.of(new).controller_state)
+    if resets is None:
+        return new
+    resets = eqx.tree_at(lambda s: s.record.rows, resets, outputs.resets.rows)
+    return with_resets_put(new, resets, outputs.resets.last_start)

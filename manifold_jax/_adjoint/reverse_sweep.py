@@ -11,7 +11,7 @@ from .._base.compat import unvmap_max
 from .._base.types import IntScalar
 from .gradient import add, Ends, Gradient, RecordedStep, TimesBar
 from .record import counted_down, Record, rows_backwards, Vectors
-from .replay import Replay, State
+from .replay import Event, Replay, State
 from .saved import Functions, SavedValues
 
 
@@ -31,6 +31,16 @@ class DenseBars(NamedTuple):
         return bar
 
 
+class ResetBars(NamedTuple):
+    """The number of resets, and the cotangents of their times and of the states before and after them;
+    of the times at which steps of the dense solution begin, and of that of the last step."""
+
+    number: IntScalar
+    rows: Any  # leading axis: resets
+    dense_ts: Any
+    last_start: Any
+
+
 class ReverseSweep(eqx.Module):
     """Transposed steps of a recorded solve."""
 
@@ -40,6 +50,7 @@ class ReverseSweep(eqx.Module):
     ends: Ends
     saved: SavedValues
     dense: DenseBars
+    resets: ResetBars | None
 
     def run(self, last_bar: State, timed: bool) -> Gradient:
         """Return the gradient from the cotangent of the last state."""
@@ -49,6 +60,8 @@ class ReverseSweep(eqx.Module):
             last_bar,
             jtu.tree_map(jnp.zeros_like, self.functions.leaves),
             self._no_times() if timed else None,
+            None if self.resets is None else jnp.zeros_like(self.ends.t0),
+            None if self.resets is None else self.resets.number,
         )
         gradient = self.saved.through_end(gradient)
         total, sizes = unvmap_max(self.ends.num_steps), self.record.sizes
@@ -72,7 +85,10 @@ class ReverseSweep(eqx.Module):
         # functions may refuse anything that is not a state or a time.
         start, end = (jnp.where(accepted, times[..., i], self.ends.t0) for i in range(2))
         jumped = accepted & (times[..., 2] > 0) if record.jumps else None
-        times = start, end, jumped, accepted
+        reset = None
+        if record.resets:
+            reset = jnp.where(accepted, times[..., 3], -1).astype(jnp.int32)
+        times = start, end, jumped, reset, accepted
         last = max(sizes.kept // sizes.segment - 1, 0)
         kept = lambda: {k: part(x, jnp.minimum(i, last)) for k, x in record.states.items()}
         again = lambda: self._states_again(i, RecordedStep(*times, {}))
@@ -91,8 +107,8 @@ class ReverseSweep(eqx.Module):
         record, packing = self.record, self.record.packing
 
         def advance(x, step):
-            of = step.start, step.end, step.begins_at_jump, packing.unpack(x)
-            new, _ = self.functions.replay.step(*of)
+            of = step.start, step.end, step.begins_at_jump, step.reset, packing.unpack(x)
+            new, *_ = self.functions.replay.step(*of)
             new = packing.pack(new)
             return {k: jnp.where(step.accepted, new[k], x[k]) for k in x}, x
 
@@ -118,22 +134,47 @@ class ReverseSweep(eqx.Module):
         state = self.record.packing.unpack(step.state)
         smooth, discrete = eqx.partition(state, eqx.is_inexact_array)
 
-        def out(replay: Replay, smooth: State, ends: Any) -> tuple[State, Any]:
-            return replay.step(*ends, step.begins_at_jump, eqx.combine(smooth, discrete))
+        def out(replay: Replay, smooth: State, ends: Any) -> tuple[State, Any, Event | None]:
+            state = eqx.combine(smooth, discrete)
+            return replay.step(*ends, step.begins_at_jump, step.reset, state)
 
         times, ends = gradient.times, (step.start, step.end)
-        (after, dense_info), pullback = self.functions.vjp(out, smooth, ends, times is not None)
+        (after, dense_info, _), pullback = self.functions.vjp(
+            out, smooth, ends, gradient.is_timed
+        )
         new = gradient
         for k in range(len(self.functions.rest.savings)):
             new = self.saved.after_step(new, k, step, after.y)
         zero = jtu.tree_map(jnp.zeros_like, dense_info)
         bar = self.dense.of(gradient.number, self.ends.num_accepted, zero)
+        start_bars = []
         for k in range(len(self.functions.rest.savings)):
-            new, bar = self.saved.inside_step(new, k, step, dense_info, bar)
-        leaves_bar, state_bar, ends_bar = pullback((new.state, bar))
-        times = new.times
+            new, bar, start_bar = self.saved.inside_step(new, k, step, dense_info, bar)
+            start_bars.append(start_bar)
+        event_bar, resets = self._of_event(new, step)
+        leaves_bar, state_bar, ends_bar = pullback((new.state, bar, event_bar))
+        times, start = new.times, None
+        if self.resets is not None:
+            start = sum(start_bars, ends_bar[0])
+            if self.resets.last_start is not None:
+                is_last = gradient.number == self.ends.num_accepted
+                start += jnp.where(is_last, self.resets.last_start, 0)
         if times is not None:
             times = times.at_ends_of_step(self.ends, step, *ends_bar)
         leaves = add(new.leaves, leaves_bar)
-        new = Gradient(new.number - 1, new.rows, state_bar, leaves, times)
+        new = Gradient(new.number - 1, new.rows, state_bar, leaves, times, start, resets)
         return jtu.tree_map(lambda a, b: jnp.where(step.accepted, a, b), new, gradient)
+
+    def _of_event(self, gradient: Gradient, step: RecordedStep) -> tuple[Any, IntScalar | None]:
+        """Return the cotangents of the event at the end of a step, which is the start of the step
+        after it, and the number of resets before it."""
+        if self.resets is None:
+            return None, None
+        is_event = step.reset >= 0  # pyright: ignore[reportOptionalOperand]
+        row = gradient.resets - 1  # pyright: ignore[reportOptionalOperand]
+        of_row = lambda b: jnp.where(is_event, b[jnp.maximum(row, 0)], 0)
+        time, before, after = jtu.tree_map(of_row, self.resets.rows)
+        time += jnp.where(is_event, gradient.start, 0)
+        if self.resets.dense_ts is not None:
+            time += jnp.where(is_event, self.resets.dense_ts[gradient.number], 0)
+        return Event(time, before, after), jnp.where(is_event, row, gradient.resets)

@@ -92,13 +92,16 @@ class SavedValues(eqx.Module):
     ) -> Gradient:
         """Transpose the value that saving `k` saves of a state."""
         saved, times = lambda replay, y, t: replay.savings[k].at_state(t, y), gradient.times
-        _, pullback = self.functions.vjp(saved, y, t, times is not None)
+        _, pullback = self.functions.vjp(saved, y, t, gradient.is_timed)
         leaves_bar, y_bar, more = pullback(bar)
+        start = gradient.start
         if times is not None:
             times = times.at_end_of_solve(self.ends, t, t_bar + more)
+        if start is not None:  # the time may be that of an event
+            start += t_bar + more
         state = gradient.state._replace(y=add(gradient.state.y, y_bar))
         leaves = add(gradient.leaves, leaves_bar)
-        return gradient._replace(state=state, leaves=leaves, times=times)
+        return gradient._replace(state=state, leaves=leaves, times=times, start=start)
 
     def after_step(self, gradient: Gradient, k: int, step: RecordedStep, y: Y) -> Gradient:
         """Transpose the row of the state after a step, if it was saved."""
@@ -115,15 +118,17 @@ class SavedValues(eqx.Module):
 
     def inside_step(
         self, gradient: Gradient, k: int, step: RecordedStep, dense_info: Any, bar: Any
-    ) -> tuple[Gradient, Any]:
-        """Transpose the rows interpolated in a step; return the cotangent of `dense_info`, too."""
+    ) -> tuple[Gradient, Any, FloatScalar]:
+        """Transpose the rows interpolated in a step; return the cotangents of `dense_info` and of the
+        start of the step, too."""
         saving, rows = self._savings[k], self.rows[k]
+        zero = jnp.zeros_like(self.ends.t0)
         if not saving.num_times:
-            return gradient, bar
+            return gradient, bar, zero
         first = gradient.number == 1
 
         def is_inside(carry):
-            gradient, _ = carry
+            gradient, *_ = carry
             row = gradient.rows[k]
             t = rows.times[row]
             # A time at the start of a step is saved at the end of the one before, unless a jump is
@@ -132,14 +137,16 @@ class SavedValues(eqx.Module):
             return step.accepted & (row >= saving.offset) & inside
 
         def through_row(carry):
-            gradient, dense_bar = carry
+            gradient, dense_bar, start_bar = carry
             row = gradient.rows[k]
 
             saved = lambda replay, info, times: replay.savings[k].in_step(*times, info)
             times, of_times = gradient.times, (rows.times[row], step.start, step.end)
             bar = jtu.tree_map(lambda b: b[row], rows.values_bar)
-            _, pullback = self.functions.vjp(saved, dense_info, of_times, times is not None)
+            _, pullback = self.functions.vjp(saved, dense_info, of_times, gradient.is_timed)
             leaves_bar, more, times_bar = pullback(bar)
+            if gradient.is_timed:
+                start_bar += times_bar[1]
             if times is not None:
                 t_bar, *ends_bar = times_bar
                 of_steps = (gradient.number - 1) // saving.steps if saving.steps else 0
@@ -149,9 +156,9 @@ class SavedValues(eqx.Module):
             following = replaced(gradient.rows, k, row - 1)
             leaves = add(gradient.leaves, leaves_bar)
             gradient = gradient._replace(rows=following, leaves=leaves, times=times)
-            return gradient, add(dense_bar, more)
+            return gradient, add(dense_bar, more), start_bar
 
-        return lax.while_loop(is_inside, through_row, (gradient, bar))
+        return lax.while_loop(is_inside, through_row, (gradient, bar, zero))
 
 
 def _only(used: Bool[Array, " rows"], x: Float[Array, "rows ..."]) -> Float[Array, "rows ..."]:

@@ -19,12 +19,13 @@ from .._base.compat import (
     while_loop,
 )
 from .._base.derivative_rule import apply_linear, ForwardRule
+from .._resets.controller import state_of_resets
 from .events import LocatingAdjoint
-from .fixed_steps import event_of_controller, SizesHeldFixed, with_end_held_fixed
+from .fixed_steps import event_of_controller, with_end_held_fixed, with_sizes_held_fixed
 from .gradient import Ends, TimesBar, with_zeros
 from .record import Record, recording
 from .replay import outputs_of, Replay, Solve, State, subs_of, with_outputs
-from .reverse_sweep import DenseBars, ReverseSweep
+from .reverse_sweep import DenseBars, ResetBars, ReverseSweep
 from .saved import Functions, Rows, SavedValues
 
 
@@ -113,7 +114,7 @@ class StepReplayAdjoint(dfx.AbstractAdjoint):
         def run(outer_while_loop):
             return diffrax_loop(
                 solver=_with_loops(solver, "lax"),
-                stepsize_controller=SizesHeldFixed(stepsize_controller),
+                stepsize_controller=with_sizes_held_fixed(stepsize_controller),
                 event=event_of_controller(event, stepsize_controller),
                 saveat=saveat,
                 t0=t0,
@@ -138,7 +139,8 @@ class StepReplayAdjoint(dfx.AbstractAdjoint):
         record = None
         if max_steps is not None:
             room = max(max_steps, 1), self.checkpoints
-            record = Record.empty(start, Progress.of(init_state).tprev.dtype, *room, solve.jumps)
+            columns = 2 + (1 if solve.jumps else 0) + (1 if solve.resetting is not None else 0)
+            record = Record.empty(start, Progress.of(init_state).tprev.dtype, *room, columns)
 
         def forward(record):
             if record is None:
@@ -232,7 +234,11 @@ def _gradient(differentiable, is_perturbed, values, cotangents_out):
         bar.event_dense_info if jtu.tree_leaves(outputs_bar.event_dense_info) else None,
     )
     saved = SavedValues(functions, ends, _rows(replay, save_states(final_state), bar, ends))
-    back = ReverseSweep(functions, record, start, ends, saved, dense)
+    resets = state_of_resets(end.controller_state)
+    if resets is not None:
+        number = jnp.minimum(resets.record.number, resets.record.indices.size)
+        resets = ResetBars(number, bar.resets.rows, bar.dense_ts, bar.resets.last_start)
+    back = ReverseSweep(functions, record, start, ends, saved, dense, resets)
     last_bar = State(bar.y, bar.solver_state)
     gradient = back.run(last_bar, timed=any(jtu.tree_leaves(is_perturbed[2])))
     times = gradient.times or TimesBar(None, None, [None] * len(ts))  # pyright: ignore[reportArgumentType]

@@ -94,6 +94,17 @@ def with_result(state: LoopState, result: RESULTS) -> LoopState:
     return eqx.tree_at(lambda s: s.result, state, update_result(state.result, result))
 
 
+def start_of_last(state: LoopState) -> Any:
+    """Return where the last step began, which is known with events only."""
+    return state.event_tprev
+
+
+def with_resets_put(state: LoopState, controller_state: Any, start_of_last: Any) -> LoopState:
+    parts = lambda s: (s.controller_state, s.event_tprev)
+    new = controller_state, start_of_last
+    return eqx.tree_at(parts, state, new, is_leaf=lambda x: x is None)
+
+
 def with_next_time(state: LoopState, tnext: Any) -> LoopState:
     """Return the state of a solve whose next step ends at `tnext`."""
     return eqx.tree_at(lambda s: s.tnext, state, tnext)
@@ -108,6 +119,7 @@ class Progress(NamedTuple):
     made_jump: Any
     y: Any
     solver_state: Any
+    controller_state: Any
     num_steps: Any
     num_accepted_steps: Any
 
@@ -156,6 +168,7 @@ class Differentiable(NamedTuple):
     event_dense_info: Any
     y: Any
     solver_state: Any
+    resets: Any = None  # not a part of Diffrax's state
 
     @staticmethod
     def of(state: LoopState) -> "Differentiable":
@@ -171,7 +184,7 @@ class Differentiable(NamedTuple):
         rows = zip(save_states(state), self.ts, self.ys, strict=True)
         saved = [replaced(lambda s: (s.ts, s.ys), s, new) for s, *new in rows]
         parts = lambda s: (s.dense_ts, s.dense_infos, s.event_dense_info, s.y, s.solver_state)
-        return replaced(parts, eqx.tree_at(save_states, state, saved), self[2:])
+        return replaced(parts, eqx.tree_at(save_states, state, saved), self[2:7])
 
 
 def scan_counts(equation: Any) -> tuple[int, int]:

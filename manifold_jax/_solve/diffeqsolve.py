@@ -1,5 +1,6 @@
 """The front end: `diffrax.diffeqsolve` plus what a solver cannot do on its own."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import diffrax as dfx
@@ -10,6 +11,7 @@ from .._base.errors import clear_errors
 from .._base.numbers import numbers_as_arrays
 from .._base.types import Args, RealScalarLike, Y
 from .._base.user_functions import evaluated
+from .._resets.reset import check_resets, Reset, ResetAt
 from .._solver.base import AbstractManifoldSolver
 from .._solver.step.implicit import with_accurate_stages, with_tolerances_of_stages
 from .arguments import (
@@ -25,6 +27,7 @@ from .finish import finish
 from .mass_matrix import trusting
 from .output import events_in_true_time, saving
 from .prepare import prepare, time_dtype
+from .resets import finish_resets, Run, with_resets
 from .setup import Consistent, ProblemData, Setup
 from .times import checking_first_step, refusing_missing_times
 
@@ -55,6 +58,8 @@ def diffeqsolve(
     controller_state: Any = None,
     made_jump: Any = None,
     consistent: Consistent = "project",
+    resets: Sequence[Reset | ResetAt] = (),
+    max_resets: int = 100,
 ) -> dfx.Solution:
     """Solve a differential equation on a manifold.
 
@@ -107,6 +112,7 @@ def diffeqsolve(
     """
     check_arguments(terms, solver, dt0, saveat, stepsize_controller, adjoint, event, consistent)
     check_max_steps(max_steps)
+    check_resets(resets, max_resets)
     warn_of_rounding(y0, time_dtype(t0, t1, dt0, saveat), stepsize_controller)
     constraint = getattr(solver, "constraint", None)
     if isinstance(solver, AbstractManifoldSolver):
@@ -114,47 +120,54 @@ def diffeqsolve(
     solver = without_idle_hook(solver, t0, y0, args)
     if throw and isinstance(stepsize_controller, dfx.ConstantStepSize) and dt0 is not None:
         y0 = raise_if_unstable(y0, terms, solver, dt0)
-    solver = _as_in_steps(solver, stepsize_controller, event, consistent, y0)
+    solver = _as_in_steps(solver, stepsize_controller, bool(resets) or event is not None, consistent, y0)
     setup = Setup(terms, solver, dt0, saveat, stepsize_controller, consistent, throw, event)
     ready = prepare(setup, ProblemData(t0, t1, y0, args))
     t0, t1, y0, _ = ready.data
     adjoint = CheckedStartAdjoint(adjoint, solver_state is not None, saveat.solver_state)
     if event is not None and event.root_finder is not None:
         adjoint = LocatingAdjoint(adjoint)
+    run = Run(solver, stepsize_controller, saving(setup), ready.solver_state, y0)
+    if solver_state is not None:
+        run = run._replace(solver_state=solver_state)
+    if resets:
+        run = with_resets(run, resets, max_resets, setup, ready)
     sol = dfx.diffeqsolve(
         terms,
-        solver,
+        run.solver,
         t0,
         t1,
         ready.dt0,
-        y0,
+        run.y0,
         args,
-        saveat=saving(setup),
-        stepsize_controller=stepsize_controller,
+        saveat=run.saveat,
+        stepsize_controller=run.controller,
         adjoint=adjoint,
         event=events_in_true_time(setup, ready),
         max_steps=max_steps,
         throw=False,
         progress_meter=progress_meter,
-        solver_state=ready.solver_state if solver_state is None else solver_state,
+        solver_state=run.solver_state,
         controller_state=controller_state,
         made_jump=made_jump,
     )
     # The dense solution, which is returned, holds the original constraint.
+    if resets:
+        return finish_resets(setup, ready, sol, constraint, saveat.controller_state)
     return finish(setup, ready, sol, constraint)
 
 
 def _as_in_steps(
     solver: Any,
     controller: dfx.AbstractStepSizeController,
-    event: dfx.Event | None,
+    has_events: bool,
     consistent: Consistent,
     y0: Y,
 ) -> Any:
     """Return the solver with the tolerances of the controller, and accurate implicit stages."""
     if isinstance(solver, AbstractManifoldSolver):
         # All interpolated values are corrected, except those with which an event is searched for.
-        solver = solver.within(controller, bends_interpolant=event is not None)
+        solver = solver.within(controller, bends_interpolant=has_events)
     else:
         warn_of_unknown_hook(solver)
         solver = with_accurate_stages(solver)

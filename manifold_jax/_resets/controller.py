@@ -1,0 +1,97 @@
+"""Step sizes around events: steps end at them and afterwards go on as before."""
+
+from typing import Any
+
+import diffrax as dfx
+import equinox as eqx
+import jax.lax as lax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+
+from .._base.types import FloatScalar, Y
+from .record import ResetRecord
+from .solver import Report
+
+
+class ResettingState(eqx.Module):
+    """The state of the controller inside, the step that was shortened for an event (0 for none), and the
+    resets so far."""
+
+    inner: Any
+    shortened: FloatScalar
+    shortened_end: FloatScalar
+    record: ResetRecord
+
+
+class ResettingController(dfx.AbstractStepSizeController):
+    """A step size controller for a [`Resetting`][] solver."""
+
+    controller: dfx.AbstractStepSizeController
+    max_resets: int = eqx.field(static=True)
+
+    def wrap(self, direction: Any) -> "ResettingController":
+        return ResettingController(self.controller.wrap(direction), self.max_resets)
+
+    def init(self, terms, t0, t1, y0, dt0, args, func, error_order) -> tuple[Any, ResettingState]:
+        first, inner = self.controller.init(terms, t0, t1, y0, dt0, args, func, error_order)
+        zero = jnp.zeros_like(t0)
+        record = ResetRecord.empty(self.max_resets, t0, y0)
+        return first, ResettingState(inner, zero, zero, record)
+
+    def adapt_step_size(
+        self, t0, t1, y0: Y, y1_candidate: Y, args, y_error: Report, error_order, controller_state
+    ) -> Any:
+        report, state = y_error, controller_state
+        keep, next_t0, next_t1, made_jump, inner, result = self.controller.adapt_step_size(
+            t0, t1, y0, y1_candidate, args, report.error, error_order, state.inner
+        )
+        at_event = keep & (report.ends_step > 0)
+        repeated = keep & (report.happens > 0) & ~at_event
+        resumed = at_event & (state.shortened > 0)
+        # Sizes have no derivatives; the time of the event has one.
+        time, length = lax.stop_gradient((report.time, t1 - t0))
+        following = jnp.where(resumed, self._resumed(state, time, next_t1), next_t1)
+        following = jnp.where(at_event, jnp.maximum(following, time), following)
+        next_t0 = jnp.where(repeated, t0, jnp.where(at_event, report.time, next_t0))
+        next_t1 = jnp.where(repeated, report.target, following)
+        if not self._is_clipped:  # the controller inside does not see steps that were shortened
+            inner = _where(resumed, state.inner, inner)
+        inner = _where(repeated, state.inner, inner)
+        first = repeated & (state.shortened == 0)
+        ends_search = keep & ~repeated & ~at_event
+        kept = jnp.where(ends_search, 0, state.shortened)
+        shortened = jnp.where(first, length, kept)
+        end = jnp.where(first, lax.stop_gradient(t1), state.shortened_end)
+        state = ResettingState(inner, shortened, end, state.record.including(at_event, report))
+        return keep & ~repeated, next_t0, next_t1, made_jump | at_event, state, result
+
+    @property
+    def _is_clipped(self) -> bool:
+        return isinstance(_innermost(self.controller), dfx.ClipStepSizeController)
+
+    def _resumed(self, state: ResettingState, time: FloatScalar, suggested: Any) -> FloatScalar:
+        """Return the end of the step after an event: as long as the one that was shortened for it, or with
+        prescribed times of steps to the same end."""
+        if self._is_clipped:
+            return suggested
+        if isinstance(_innermost(self.controller), dfx.ConstantStepSize | dfx.StepTo):
+            return state.shortened_end
+        return time + state.shortened
+
+
+def _innermost(controller: Any) -> Any:
+    """Return the user's controller, inside the wrapper of an adjoint."""
+    known = dfx.PIDController | dfx.ClipStepSizeController | dfx.ConstantStepSize | dfx.StepTo
+    while not isinstance(controller, known) and hasattr(controller, "controller"):
+        controller = controller.controller
+    return controller
+
+
+def _where(condition: Any, a: Any, b: Any) -> Any:
+    select = lambda x, y: jnp.where(condition, x, y) if eqx.is_array(y) else y
+    return jtu.tree_map(select, a, b)
+
+
+def state_of_resets(controller_state: Any) -> ResettingState | None:
+    """Return the state of the controller of a solve with resets."""
+    return controller_state if isinstance(controller_state, ResettingState) else None

@@ -1,0 +1,124 @@
+"""One reset: the time of its event and the states before and after it, with their derivatives."""
+
+from typing import Any, NamedTuple
+
+import diffrax as dfx
+import jax
+import jax.lax as lax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+
+from .._base.compat import time_direction, undirected
+from .._base.known_value import known_value
+from .._base.rejection import is_finite
+from .._base.types import BoolScalar, FloatScalar, IntScalar, Y
+from .._rosenbrock import MassMatrixTerm
+from .._solver.base import AbstractManifoldSolver
+from .._solver.unconstrained import Unconstrained
+from .conditions import Conditions
+
+
+class Jump(NamedTuple):
+    """The time of an event in the time of Diffrax, the states before and after it, and whether the
+    latter is usable: finite, and on the manifold."""
+
+    time: FloatScalar
+    before: Y
+    after: Y
+    success: BoolScalar
+
+
+def jump_at_end(
+    conditions: Conditions,
+    solver: dfx.AbstractSolver,
+    terms: Any,
+    number: IntScalar,
+    end: FloatScalar,
+    time: FloatScalar,
+    y: Y,
+) -> Jump:
+    """Make the reset `number` at the end of a step, with the derivative of the time of its event.
+
+    The step ends at `end`, which is held fixed as that of every other step, in the state `y`. The event
+    is at `time`, equal to it up to rounding, and by an amount that depends on parameters.
+    """
+    direction = time_direction(terms)
+    shifted = lambda end, y: _time_and_state_of_event(conditions, terms, number, end, y)
+    time, before = known_value(shifted, (time, y), lax.stop_gradient(end), y)
+    after = conditions.jump(number, time * direction, before)
+    after, success = _consistent(conditions, solver, terms, time * direction, after)
+    return Jump(time, before, after, success & is_finite(after))
+
+
+def _time_and_state_of_event(
+    conditions: Conditions, terms: Any, number: IntScalar, end: FloatScalar, y: Y
+) -> tuple[FloatScalar, Y]:
+    """Return `end` and `y` as functions of everything that the event depends on.
+
+    The event is at `end + d`, where `d` is the zero of `distance(end + d, flow_d(y))` near 0, and the
+    flow over such a small time is a step of the midpoint rule: exact for first and second derivatives
+    with respect to `d`, as is `d` after two iterations `d - distance / rate` from 0.
+    """
+    direction = time_direction(terms)
+    field = _field(terms, conditions.args)
+    distance = lambda t, y: conditions.distance(number, t * direction, y)
+    rate = jax.jvp(distance, (end, y), (jnp.ones_like(end), field(end, y)))[1]
+    rate = lax.stop_gradient(jnp.where(rate == 0, 1, rate))
+
+    def flow(d: FloatScalar) -> Y:
+        moved = lambda y0, f: jtu.tree_map(lambda a, b: a + (d * b).astype(a.dtype), y0, f)
+
+        def stage(middle: Y, _: None) -> tuple[Y, Y]:
+            """Evaluate the field first at the start, then in the middle."""
+            at, fraction = middle
+            velocity = field(end + fraction * d, at)
+            half = jtu.tree_map(lambda a, b: a + (0.5 * d * b).astype(a.dtype), y, velocity)
+            return (half, jnp.full_like(d, 0.5)), velocity
+
+        _, velocities = lax.scan(stage, (y, jnp.zeros_like(d)), None, length=2)
+        return moved(y, jtu.tree_map(lambda v: v[1], velocities))
+
+    def iterate(carry: tuple, _: None) -> tuple[tuple, None]:
+        following, *_ = carry
+        state = flow(following)
+        value = distance(end + following, state)
+        # Its value is the rounding of the search and changes nothing.
+        value = value - lax.stop_gradient(value)
+        return (following - value / rate, following, state), None
+
+    start = jnp.zeros_like(end), jnp.zeros_like(end), y
+    (_, d, state), _ = lax.scan(iterate, start, None, length=3)
+    return end + d, state
+
+
+def _field(terms: Any, args: Any) -> Any:
+    """Return the vector field in the time of Diffrax."""
+    term = undirected(terms)
+    if isinstance(term, MassMatrixTerm):
+        direction = time_direction(terms)
+
+        def derivative(t: FloatScalar, y: Y) -> Y:
+            velocity = term.derivative(t * direction, y, args)
+            return jtu.tree_map(lambda v: (v * direction).astype(v.dtype), velocity)
+
+        return derivative
+
+    def field(t: FloatScalar, y: Y) -> Y:
+        return terms.vf_prod(t, y, args, terms.contr(t, t + jnp.ones_like(t)))
+
+    return field
+
+
+def _consistent(
+    conditions: Conditions, solver: Any, terms: Any, t: FloatScalar, y: Y
+) -> tuple[Y, BoolScalar]:
+    """Return a state on the manifold, at the true time; algebraic equations are solved from it."""
+    success, args = jnp.asarray(True), conditions.args
+    term = undirected(terms)
+    if isinstance(term, MassMatrixTerm):
+        y, info = term.consistent_state(t, y, args, throw=False)
+        success &= info.success
+    if isinstance(solver, AbstractManifoldSolver) and not isinstance(solver, Unconstrained):
+        y, info = solver.correct(t, y, args)
+        success &= info.success
+    return y, success

@@ -1,0 +1,78 @@
+"""A solve with resets: the loop around the solver and the controller, and the report of the resets."""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import diffrax as dfx
+import equinox as eqx
+import jax.numpy as jnp
+import jax.tree_util as jtu
+
+from .._base.types import Y
+from .._resets.conditions import Conditions
+from .._resets.controller import ResettingController, ResettingState
+from .._resets.record import Resets
+from .._resets.reset import Reset, ResetAt
+from .._resets.solver import ResetState, Resetting
+from .finish import finish
+from .prepare import Ready
+from .setup import Setup
+
+
+_TRUE_AT_START = (
+    "A Boolean `condition` in `resets` is true at `t0`, but an event is where it becomes true. Make the jump in `y0` if it "
+    "is meant to happen at the start, or write a condition that is false there."
+)
+
+
+class Run(NamedTuple):
+    """What Diffrax is given for a solve."""
+
+    solver: dfx.AbstractSolver
+    controller: dfx.AbstractStepSizeController
+    saveat: dfx.SaveAt
+    solver_state: Any
+    y0: Y
+
+
+class SolutionWithResets(dfx.Solution):
+    """The solution of [`diffeqsolve`][] with `resets`, which `resets` reports."""
+
+    resets: Resets
+
+
+def with_resets(
+    run: Run, resets: Sequence[Reset | ResetAt], max_resets: int, setup: Setup, ready: Ready
+) -> Run:
+    """Return what Diffrax is given for a solve with resets."""
+    t0, t1, _, args = ready.data
+    dtype = jnp.result_type(ready.data.direction)
+    y0 = jtu.tree_map(jnp.asarray, run.y0)
+    t0, t1 = jnp.asarray(t0, dtype), jnp.asarray(t1, dtype)
+    conditions = Conditions.of(resets, t0, y0, args)
+    if setup.throw and any(conditions.is_boolean):
+        y0 = eqx.error_if(y0, jnp.any(conditions.true_at_start(t0, y0)), _TRUE_AT_START)
+    direction = ready.data.direction
+    solver = Resetting(run.solver, conditions, t0 * direction, t1 * direction, max_resets)
+    state = None if run.solver_state is None else solver.starting(run.solver_state)
+    controller = ResettingController(run.controller, max_resets)
+    saveat = eqx.tree_at(lambda s: (s.solver_state, s.controller_state), run.saveat, (True, True))
+    return Run(solver, controller, saveat, state, y0)
+
+
+def finish_resets(
+    setup: Setup, ready: Ready, sol: dfx.Solution, constraint: Any, keeps_controller_state: bool
+) -> SolutionWithResets:
+    """Report a solve with resets."""
+    state, controller_state = sol.solver_state, sol.controller_state
+    assert isinstance(state, ResetState)
+    assert isinstance(controller_state, ResettingState)
+    resets = controller_state.record.read(ready.data.direction)
+    where = lambda s: (s.solver_state, s.controller_state)
+    kept = controller_state.inner if keeps_controller_state else None
+    sol = eqx.tree_at(where, sol, (state.inner, kept), is_leaf=lambda x: x is None)
+    sol = finish(setup, ready, sol, constraint)
+    fields = {name: getattr(sol, name) for name in dfx.Solution.__dataclass_fields__}
+    if not setup.saveat.solver_state:
+        fields["solver_state"] = None
+    return SolutionWithResets(**fields, resets=resets)
