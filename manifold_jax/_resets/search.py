@@ -40,14 +40,14 @@ class History(eqx.Module):
     """What a solve remembers of its events from step to step."""
 
     after_reset: BoolScalar  # whether the step begins at an event, or is the first one
-    sides: Float[Array, " resets"]  # signs of the conditions before the last jump; NaN in the first step
+    # The conditions just before the last jump: their values, infinite where only the sign is known, and NaN
+    # for the one that caused it, which may have any sign after it.
+    sides: Float[Array, " resets"]
     happened: Int[Array, " resets"]  # how often each has happened
 
     @staticmethod
     def initial(count: int, dtype: Any) -> "History":
-        return History(
-            jnp.asarray(True), jnp.full(count, jnp.nan, dtype), jnp.zeros(count, jnp.int32)
-        )
+        return History(jnp.asarray(True), jnp.zeros(count, dtype), jnp.zeros(count, jnp.int32))
 
 
 class Found(NamedTuple):
@@ -58,7 +58,7 @@ class Found(NamedTuple):
     target: FloatScalar  # where a step has to end so that the event is at its end
     ends_step: BoolScalar  # whether this step ends there
     time: FloatScalar  # of the event, if it does
-    sides: Float[Array, " resets"]  # signs of the conditions just before the jump
+    sides: Float[Array, " resets"]  # as in [`History`][]
     defined: BoolScalar  # whether no condition was NaN
 
 
@@ -90,7 +90,7 @@ class Search(NamedTuple):
             step.t1,
             jnp.asarray(False),
             step.t1,
-            signs[self.samples],
+            values[self.samples],
             defined,
         )
         return lax.cond(
@@ -137,22 +137,24 @@ class Search(NamedTuple):
         noise_in_time = jnp.where(self.is_boolean, 1e-12, noise_in_time)
         tolerance = 16 * rounding + jnp.abs(step.length) * noise_in_time
         tolerance = jnp.where(is_known, 4 * rounding, tolerance)
-        return self._chosen(step, roots, at_once, signs, place, tolerance)
+        return self._chosen(step, roots, at_once, signs, place, tolerance, values[self.samples])
 
     def _start(self, step: Step, history: History, values: Array, noise: Array) -> tuple:
         """Return the signs just before and just after the start of the step, and which conditions are
         zero there up to rounding; the sign of these is that of their rate of change."""
         largest = jnp.max(jnp.abs(values[1 : self.samples + 1]), axis=0)
-        size = jnp.abs(values[0])
-        on_surface = history.after_reset & ((size <= 4 * noise) | (size <= 1e-6 * largest))
+        is_zero = lambda v: (jnp.abs(v) <= 4 * noise) | (jnp.abs(v) <= 1e-6 * largest)
+        on_surface = history.after_reset & is_zero(values[0])
         on_surface &= ~self.is_boolean & ~jnp.isfinite(self.known_times)
         along = lambda t: self.values(t, step.plain_path(t))
         rate = jax.jvp(along, (step.t0,), (jnp.ones_like(step.t0),))[1]
         rate = jnp.where(jnp.abs(rate * step.length) <= 1e-10 * largest, 0, rate)
         start = jnp.where(on_surface, jnp.sign(rate), jnp.sign(values[0]))
-        first = jnp.where(on_surface, -self.directions, 0)
-        before = jnp.where(jnp.isnan(history.sides), first, history.sides)
-        return jnp.where(history.after_reset, before, 0), start, on_surface
+        # One that was zero before the jump as well is taken to have been on the side it can leave.
+        touching = jnp.where(on_surface, -self.directions, 0)
+        before = jnp.where(is_zero(history.sides), touching, jnp.sign(history.sides))
+        unknown = jnp.isnan(history.sides) | ~history.after_reset
+        return jnp.where(unknown, 0, before), start, on_surface
 
     def _noise(self, step: Step, end: Array) -> Float[Array, " resets"]:
         """Return how much rounding of the state may change the conditions at the end of the step."""
@@ -193,6 +195,7 @@ class Search(NamedTuple):
         signs: Array,
         place: Array,
         tolerance: Array,
+        end: Array,
     ) -> Found:
         """Choose the earliest event: of several at one time the first."""
         near = (jnp.abs(roots - step.t1) <= tolerance) & ~at_once
@@ -203,7 +206,8 @@ class Search(NamedTuple):
         same = jnp.where(is_at_end, near, roots == earliest)
         number = jnp.argmax(same & happens).astype(jnp.int32)
         place = jnp.minimum(place, self.samples)
-        before = jnp.where(near, signs[place, jnp.arange(place.size)], signs[self.samples])
+        infinite = lambda sign: jnp.where(sign == 0, 0, sign * jnp.inf)
+        before = jnp.where(near, infinite(signs[place, jnp.arange(place.size)]), end)
         target = jnp.maximum(_before(earliest), _after(step.t0))
         unit = _unit(step.t0)
         target = jnp.where(at_once[number], step.t0 - (number + 1).astype(unit.dtype) * unit, target)
@@ -217,7 +221,7 @@ class Search(NamedTuple):
             target,
             is_at_end | backwards,
             jnp.where(backwards, step.t0, _after(step.t1)),
-            jnp.where(backwards, signs[0], before).at[number].set(0),
+            jnp.where(backwards, infinite(signs[0]), before).at[number].set(jnp.nan),
             jnp.asarray(True),
         )
 

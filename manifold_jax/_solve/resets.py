@@ -8,6 +8,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import jax.tree_util as jtu
 
+from .._base.compat import use_stepsize_tol
 from .._base.types import Y
 from .._resets.conditions import Conditions
 from .._resets.controller import ResettingController, ResettingState
@@ -53,11 +54,25 @@ def with_resets(
     if setup.throw and any(conditions.is_boolean):
         y0 = eqx.error_if(y0, jnp.any(conditions.true_at_start(t0, y0)), _TRUE_AT_START)
     direction = ready.data.direction
-    solver = Resetting(run.solver, conditions, t0 * direction, t1 * direction, max_resets)
+    inner = _with_tolerances(run.solver, run.controller)
+    solver = Resetting(inner, conditions, t0 * direction, t1 * direction, max_resets)
     state = None if run.solver_state is None else solver.starting(run.solver_state)
     controller = ResettingController(run.controller, max_resets)
     saveat = eqx.tree_at(lambda s: (s.solver_state, s.controller_state), run.saveat, (True, True))
     return Run(solver, controller, saveat, state, y0)
+
+
+def _with_tolerances(solver: Any, controller: Any) -> Any:
+    """Return an implicit solver with the tolerances of the controller, as Diffrax does for controllers
+    that it knows."""
+    if not isinstance(solver, dfx.AbstractImplicitSolver):
+        return solver
+    names = ("rtol", "atol", "norm")
+    open_ = [n for n in names if getattr(solver.root_finder, n) is use_stepsize_tol]
+    if not open_ or not hasattr(controller, "rtol"):
+        return solver
+    where = lambda s: [getattr(s.root_finder, name) for name in open_]
+    return eqx.tree_at(where, solver, [getattr(controller, name) for name in open_])
 
 
 def finish_resets(
