@@ -103,6 +103,8 @@ class Record(eqx.Module):
     firsts: Vectors  # (segments, n); empty if all states are kept
     packing: Packing = eqx.field(static=True)
     sizes: Sizes = eqx.field(static=True)
+    jumps: bool = eqx.field(static=True)  # whether steps may begin after jumps of the field
+    resets: bool = eqx.field(static=True)  # whether steps may end at a reset
 
     @staticmethod
     def empty(
@@ -110,7 +112,8 @@ class Record(eqx.Module):
         time_dtype: Any,
         max_steps: int,
         checkpoints: int | None,
-        columns: int,
+        jumps: bool,
+        resets: bool,
     ) -> "Record":
         """Return a record without steps. Its columns are the start and the end of a step, whether it begins
         after a jump of the field, and which reset is at its end; the last two only where they are used."""
@@ -120,17 +123,9 @@ class Record(eqx.Module):
         room = lambda rows, v: jnp.zeros((*rows, v.size), v.dtype)
         segments = 0 if sizes.kept == sizes.blocks else sizes.blocks // sizes.segment
         kept = {k: room((sizes.kept, sizes.block), v) for k, v in x.items() if sizes.kept}
-        times = jnp.full((sizes.blocks, sizes.block, columns), -jnp.inf, time_dtype)
+        times = jnp.full((sizes.blocks, sizes.block, 2 + jumps + resets), -jnp.inf, time_dtype)
         firsts = {k: room((segments,), v) for k, v in x.items() if segments}
-        return Record(times, kept, firsts, packing, sizes)
-
-    @property
-    def jumps(self) -> bool:
-        return self.times.shape[2] >= 3
-
-    @property
-    def resets(self) -> bool:
-        return self.times.shape[2] == 4
+        return Record(times, kept, firsts, packing, sizes, jumps, resets)
 
     def including(self, i: IntScalar, row: Float[Array, " columns"], x: Vectors) -> "Record":
         """Return the record with step number `i`, made from `x`."""
@@ -142,7 +137,7 @@ class Record(eqx.Module):
         is_kept = block < sizes.kept
         states = {k: buffer_at_set(b, at, x[k], pred=is_kept) for k, b in self.states.items()}  # pyright: ignore[reportArgumentType]
         times = buffer_at_set(self.times, (block, within), row)
-        return Record(times, states, firsts, self.packing, sizes)  # pyright: ignore[reportArgumentType]
+        return Record(times, states, firsts, self.packing, sizes, self.jumps, self.resets)  # pyright: ignore[reportArgumentType]
 
 
 def counted_down(count: IntScalar, through: Callable, carry: Any) -> Any:
@@ -182,7 +177,7 @@ def recording(record: Record, of: Callable[[Any], Any], run: Callable) -> tuple[
                 row.append(jnp.asarray(now.made_jump, now.tprev.dtype))
             if record.resets:
                 before, after = (state_of_resets(p.controller_state).record for p in (now, end))
-                which = after.indices[jnp.minimum(before.number, after.indices.size - 1)]
+                which = after.indices[before.number]
                 which = jnp.where(after.number > before.number, which, -1)
                 row.append(which.astype(now.tprev.dtype))
             x = record.packing.pack(of(state))

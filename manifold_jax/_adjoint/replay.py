@@ -15,12 +15,12 @@ from .._base.closure import convert_closure
 from .._base.compat import Differentiable, LoopState, Progress, start_of_last, with_resets_put
 from .._base.types import Args, FloatScalar, IntScalar, RealScalarLike, Y
 from .._constraint.projection_info import ProjectionInfo
-from .._resets.controller import state_of_resets
-from .._resets.solver import ResetState, Resetting
+from .._resets.controller import ResettingController, state_of_resets
+from .._resets.solver import inner_state, ResetState, Resetting
 from .._solver.base import AbstractManifoldSolver
 from .._solver.step.execution import execution_of, ExplicitStep
 from .._solver.step.frame import StepFrame
-from .._solver.step.hook_state import HookState
+from .._solver.step.hook_state import memory_of, with_memory
 
 
 class State(NamedTuple):
@@ -69,7 +69,8 @@ class Replay(eqx.Module):
         interpolates = dense or any(sub.ts is not None for sub in subs)
 
         def step(start, end, jumped, reset, state):
-            after, dense_info, event = solve.attempt(start, end, jumped, reset, state)
+            after, dense_info = solve.attempt(start, end, jumped, state)
+            after, event = solve.reset(start, end, reset, state, after)
             return after, dense_info if interpolates else None, event
 
         jumped, reset = t != t if solve.jumps else False, None
@@ -134,30 +135,17 @@ class Solve(NamedTuple):
             remembers = not isinstance(execution_of(solver, terms, *example), ExplicitStep)
         jumps = may_jump(controller, begin.made_jump)
         solver_state = lax.stop_gradient(begin.solver_state)
-        if isinstance(solver_state, ResetState):
-            solver_state = solver_state.inner
+        solver_state = inner_state(solver_state)
         return Solve(terms, solver, args, solver_state, remembers, jumps, resetting)
 
     def state(self, loop_state: LoopState) -> State:
         now = Progress.of(loop_state)
-        return State(now.y, memory_of(now.solver_state) if self.remembers else None)
+        return State(now.y, memory_of(inner_state(now.solver_state)) if self.remembers else None)
 
     def attempt(
-        self, start: Any, end: Any, jumped: Any, reset: IntScalar | None, state: State
-    ) -> tuple[State, Any, Event | None]:
-        """Return the state after a step and after the reset at its end, if there is one (of this number,
-        otherwise -1), the data of its interpolation, and the event."""
-        after, dense_info = self._attempt(start, end, jumped, state)
-        if self.resetting is None or reset is None:
-            return after, dense_info, None
-        y = self.resetting.end_of_step(start, end, state.y, after.y)
-        number = jnp.maximum(reset, 0)
-        jump = self.resetting.jump(self.terms, reset >= 0, number, end, end, y)
-        return State(jump.after, after.memory), dense_info, Event(jump.time, jump.before, jump.after)
-
-    def _attempt(
         self, start: RealScalarLike, end: RealScalarLike, jumped: Any, state: State
     ) -> tuple[State, Any]:
+        """Return the state after a step, and the data of its interpolation."""
         terms, solver, args, y = self.terms, self.solver, self.args, state.y
         if not self.remembers and not isinstance(solver, AbstractManifoldSolver):
             unchanged = lambda y: (y, ProjectionInfo.of_nothing(y, jnp.asarray(True)))
@@ -170,24 +158,21 @@ class Solve(NamedTuple):
         )
         return State(y1, memory_of(solver_state) if self.remembers else None), dense_info
 
+    def reset(
+        self, start: Any, end: Any, number: IntScalar | None, state: State, after: State
+    ) -> tuple[State, Event | None]:
+        """Return the state after the reset at the end of a step, and its event; `number` is -1 where there
+        is none."""
+        if self.resetting is None or number is None:
+            return after, None
+        y = self.resetting.end_of_step(start, end, state.y, after.y)
+        which = jnp.maximum(number, 0)
+        jump = self.resetting.jump(self.terms, number >= 0, which, end, end, y, after.memory)
+        return State(jump.after, jump.memory), Event(jump.time, jump.before, jump.after)
+
 
 def subs_of(saveat: dfx.SaveAt) -> list[dfx.SubSaveAt]:
     return jtu.tree_leaves(saveat.subs, is_leaf=lambda x: isinstance(x, dfx.SubSaveAt))
-
-
-def memory_of(solver_state: Any) -> Any:
-    """Return the memory of a hook without its statistics, which no step depends on."""
-    if isinstance(solver_state, ResetState):
-        return memory_of(solver_state.inner)
-    return solver_state.memory if isinstance(solver_state, HookState) else solver_state
-
-
-def with_memory(solver_state: Any, memory: Any) -> Any:
-    if isinstance(solver_state, ResetState):
-        return dataclasses.replace(solver_state, inner=with_memory(solver_state.inner, memory))
-    if isinstance(solver_state, HookState):
-        return dataclasses.replace(solver_state, memory=memory)
-    return memory
 
 
 def may_jump(controller: Any, made_jump: Any) -> bool:
@@ -197,6 +182,8 @@ def may_jump(controller: Any, made_jump: Any) -> bool:
         if controller.jump_ts is not None:
             return True
         controller = controller.controller
+    if isinstance(controller, ResettingController):
+        return may_jump(controller.controller, made_jump)
     known = dfx.ConstantStepSize | dfx.StepTo | dfx.PIDController
     return not isinstance(controller, known)
 
@@ -204,7 +191,7 @@ def may_jump(controller: Any, made_jump: Any) -> bool:
 def outputs_of(final_state: LoopState, remembers: bool) -> Differentiable:
     """Return the differentiable part of a final state; of the solver's state, what steps depend on."""
     found = Differentiable.of(final_state)
-    memory = memory_of(found.solver_state) if remembers else None
+    memory = memory_of(inner_state(found.solver_state)) if remembers else None
     resets = state_of_resets(Progress.of(final_state).controller_state)
     if resets is not None:
         found = found._replace(resets=ResetOutputs(resets.record.rows, start_of_last(final_state)))
@@ -214,10 +201,17 @@ def outputs_of(final_state: LoopState, remembers: bool) -> Differentiable:
 def with_outputs(final_state: LoopState, outputs: Differentiable) -> LoopState:
     given = Differentiable.of(final_state).solver_state
     memory = outputs.solver_state
-    solver_state = given if memory is None else with_memory(given, memory)
+    solver_state = given if memory is None else _with_memory(given, memory)
     new = outputs._replace(solver_state=solver_state).put_into(final_state)
     resets = state_of_resets(Progress.of(new).controller_state)
     if resets is None:
         return new
     resets = eqx.tree_at(lambda s: s.record.rows, resets, outputs.resets.rows)
     return with_resets_put(new, resets, outputs.resets.last_start)
+
+
+def _with_memory(solver_state: Any, memory: Any) -> Any:
+    inner = with_memory(inner_state(solver_state), memory)
+    if isinstance(solver_state, ResetState):
+        return dataclasses.replace(solver_state, inner=inner)
+    return inner

@@ -87,7 +87,7 @@ class ReverseSweep(eqx.Module):
         jumped = accepted & (times[..., 2] > 0) if record.jumps else None
         reset = None
         if record.resets:
-            reset = jnp.where(accepted, times[..., 3], -1).astype(jnp.int32)
+            reset = jnp.where(accepted, times[..., -1], -1).astype(jnp.int32)
         times = start, end, jumped, reset, accepted
         last = max(sizes.kept // sizes.segment - 1, 0)
         kept = lambda: {k: part(x, jnp.minimum(i, last)) for k, x in record.states.items()}

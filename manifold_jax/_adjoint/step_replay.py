@@ -139,8 +139,8 @@ class StepReplayAdjoint(dfx.AbstractAdjoint):
         record = None
         if max_steps is not None:
             room = max(max_steps, 1), self.checkpoints
-            columns = 2 + (1 if solve.jumps else 0) + (1 if solve.resetting is not None else 0)
-            record = Record.empty(start, Progress.of(init_state).tprev.dtype, *room, columns)
+            kinds = solve.jumps, solve.resetting is not None
+            record = Record.empty(start, Progress.of(init_state).tprev.dtype, *room, *kinds)
 
         def forward(record):
             if record is None:
@@ -236,8 +236,7 @@ def _gradient(differentiable, is_perturbed, values, cotangents_out):
     saved = SavedValues(functions, ends, _rows(replay, save_states(final_state), bar, ends))
     resets = state_of_resets(end.controller_state)
     if resets is not None:
-        number = jnp.minimum(resets.record.number, resets.record.indices.size)
-        resets = ResetBars(number, bar.resets.rows, bar.dense_ts, bar.resets.last_start)
+        resets = ResetBars(resets.record.number, bar.resets.rows, bar.dense_ts, bar.resets.last_start)
     back = ReverseSweep(functions, record, start, ends, saved, dense, resets)
     last_bar = State(bar.y, bar.solver_state)
     gradient = back.run(last_bar, timed=any(jtu.tree_leaves(is_perturbed[2])))

@@ -41,19 +41,19 @@ class ResettingController(dfx.AbstractStepSizeController):
     def adapt_step_size(
         self, t0, t1, y0: Y, y1_candidate: Y, args, y_error: Report, error_order, controller_state
     ) -> Any:
-        report, state = y_error, controller_state
+        met, state = y_error.met, controller_state
         keep, next_t0, next_t1, made_jump, inner, result = self.controller.adapt_step_size(
-            t0, t1, y0, y1_candidate, args, report.error, error_order, state.inner
+            t0, t1, y0, y1_candidate, args, y_error.error, error_order, state.inner
         )
-        at_event = keep & (report.ends_step > 0)
-        repeated = keep & (report.happens > 0) & ~at_event
+        at_event = keep & met.ends_step
+        repeated = keep & met.happens & ~at_event
         resumed = at_event & (state.shortened > 0)
         # Sizes have no derivatives; the time of the event has one.
-        time, length = lax.stop_gradient((report.time, t1 - t0))
+        time, length = lax.stop_gradient((met.time, t1 - t0))
         following = jnp.where(resumed, self._resumed(state, time, next_t1), next_t1)
         following = jnp.where(at_event, jnp.maximum(following, time), following)
-        next_t0 = jnp.where(repeated, t0, jnp.where(at_event, report.time, next_t0))
-        next_t1 = jnp.where(repeated, report.target, following)
+        next_t0 = jnp.where(repeated, t0, jnp.where(at_event, met.time, next_t0))
+        next_t1 = jnp.where(repeated, met.target, following)
         if not self._is_clipped:  # the controller inside does not see steps that were shortened
             inner = _where(resumed, state.inner, inner)
         inner = _where(repeated, state.inner, inner)
@@ -62,8 +62,8 @@ class ResettingController(dfx.AbstractStepSizeController):
         kept = jnp.where(ends_search, 0, state.shortened)
         shortened = jnp.where(first, length, kept)
         end = jnp.where(first, lax.stop_gradient(t1), state.shortened_end)
-        state = ResettingState(inner, shortened, end, state.record.including(at_event, report))
-        return keep & ~repeated, next_t0, next_t1, made_jump | at_event, state, result
+        state = ResettingState(inner, shortened, end, state.record.including(at_event, met))
+        return keep & ~repeated, next_t0, next_t1, made_jump, state, result
 
     @property
     def _is_clipped(self) -> bool:

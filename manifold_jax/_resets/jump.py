@@ -26,6 +26,7 @@ class Jump(NamedTuple):
     before: Y
     after: Y
     success: BoolScalar
+    memory: Any = None  # of the solver, for the step that begins there
 
 
 def jump_at_end(

@@ -3,6 +3,7 @@
 from typing import Any
 
 import equinox as eqx
+import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, Float, Int
@@ -39,23 +40,28 @@ class ResetRecord(eqx.Module):
 
     @staticmethod
     def empty(count: int, t: Any, y: Y) -> "ResetRecord":
-        room = lambda x: jnp.full((count, *jnp.shape(x)), jnp.inf, jnp.result_type(x))
+        """Return a record with room for `count` resets. There is one more row, for what is not one."""
+        room = lambda x: jnp.full((count + 1, *jnp.shape(x)), jnp.inf, jnp.result_type(x))
         rows = jtu.tree_map(room, (t, y, y))
-        return ResetRecord(jnp.zeros((), jnp.int32), jnp.full(count, -1, jnp.int32), rows)
+        return ResetRecord(jnp.zeros((), jnp.int32), jnp.full(count + 1, -1, jnp.int32), rows)
 
-    def including(self, happened: BoolScalar, report: Any) -> "ResetRecord":
-        row = jnp.where(happened, self.number, self.indices.size)  # beyond the end: dropped
-        put = lambda xs, x: xs.at[row].set(x.astype(xs.dtype), mode="drop")
-        new = report.time, report.before, report.after
-        return ResetRecord(
-            self.number + happened.astype(jnp.int32),
-            self.indices.at[row].set(report.number.astype(jnp.int32), mode="drop"),
-            jtu.tree_map(put, self.rows, new),
-        )
+    def including(self, happened: BoolScalar, met: Any) -> "ResetRecord":
+        # The next row is always written, which is cheaper than doing it on a condition.
+        put = lambda xs, x: lax.dynamic_update_index_in_dim(xs, x.astype(xs.dtype), self.number, 0)
+        rows = jtu.tree_map(put, self.rows, (met.time, met.before, met.after))
+        indices = put(self.indices, met.number)
+        return ResetRecord(self.number + happened.astype(jnp.int32), indices, rows)
 
     def read(self, direction: Any) -> Resets:
-        times, before, after = self.rows
-        number = jnp.minimum(self.number, self.indices.size)
-        used = jnp.arange(self.indices.size, dtype=number.dtype) < number
-        times = jnp.where(used, jnp.where(used, times, 0) * direction, jnp.inf)
-        return Resets(number, times, self.indices, before, after)
+        count = self.indices.size - 1
+        number = jnp.minimum(self.number, count)
+        used = jnp.arange(count, dtype=number.dtype) < number
+
+        def only_used(x: Array, empty: float) -> Array:
+            where = used.reshape(-1, *[1] * (x.ndim - 1))
+            return jnp.where(where, x[:count], jnp.asarray(empty, x.dtype))
+
+        times, before, after = jtu.tree_map(lambda x: only_used(x, jnp.inf), self.rows)
+        times = jnp.where(used, only_used(self.rows[0], 0) * direction, times)
+        indices = jnp.where(used, self.indices[:count], -1)
+        return Resets(number, times, indices, before, after)

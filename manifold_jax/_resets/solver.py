@@ -7,6 +7,7 @@ import equinox as eqx
 import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
+import numpy as np
 from diffrax import RESULTS
 from jaxtyping import Array, Float
 
@@ -15,23 +16,68 @@ from .._base.compat import nonlinear_failure, time_direction, update_result
 from .._base.types import Args, BoolScalar, FloatScalar, IntScalar, RealScalarLike, Y
 from .._linalg.newton import without_derivative
 from .._solver.base import AbstractManifoldSolver
+from .._solver.step.hook_state import memory_of, with_memory
 from .conditions import Conditions
 from .jump import Jump, jump_at_end
-from .search import Found, History, Search, Step
+from .search import EventSearch, Found, History, Samples, SearchedStep
+
+
+class Met(NamedTuple):
+    """The event that a step meets. All leaves are real numbers, few of them: a branch copies them."""
+
+    numbers: Float[Array, " 7"]
+    sides: Float[Array, " resets"]
+    time: FloatScalar
+    before: Y
+    after: Y
+    memory: Any
+    defined: BoolScalar | bool = True
+
+    @staticmethod
+    def of(found: Found, exhausted: BoolScalar, jump: Jump) -> "Met":
+        real = lambda x: jnp.asarray(x, found.target.dtype)
+        numbers = found.happens, found.ends_step, exhausted, found.number, jump.success
+        numbers = jnp.stack([found.target, *map(real, numbers)])
+        return Met(numbers, found.sides, jump.time, jump.before, jump.after, jump.memory)
+
+    @staticmethod
+    def without_event(t: FloatScalar, y: Y, memory: Any, history: History) -> "Met":
+        numbers = jnp.asarray([0, 0, 0, 0, 0, 1], t.dtype)
+        return Met(numbers, history.sides, t, y, y, memory)
+
+    @property
+    def target(self) -> FloatScalar:
+        return self.numbers[0]
+
+    @property
+    def happens(self) -> BoolScalar:
+        return self.numbers[1] > 0
+
+    @property
+    def ends_step(self) -> BoolScalar:
+        return self.numbers[2] > 0
+
+    @property
+    def exhausted(self) -> BoolScalar:
+        return self.numbers[3] > 0
+
+    @property
+    def number(self) -> IntScalar:
+        return self.numbers[4].astype(jnp.int32)
+
+    @property
+    def result(self) -> RESULTS:
+        success = RESULTS.where(self.numbers[5] > 0, RESULTS.successful, nonlinear_failure())
+        result = RESULTS.where(self.exhausted, RESULTS.max_steps_reached, success)  # pyright: ignore[reportArgumentType]
+        return RESULTS.where(self.defined, result, RESULTS.nonfinite_input)  # pyright: ignore[reportArgumentType]
 
 
 class Report(NamedTuple):
     """The error estimate of a step, and what the step size controller has to know of the event in it.
-    Diffrax hands it on as the error estimate; all its leaves are real numbers."""
+    Diffrax hands it on as the error estimate."""
 
     error: Y | None
-    happens: Float[Array, ""]  # 1 if there is an event in the step or just after it
-    ends_step: Float[Array, ""]  # 1 if it is at the end of the step
-    number: Float[Array, ""]
-    target: FloatScalar
-    time: FloatScalar
-    before: Y
-    after: Y
+    met: Met
 
 
 class ResetState(eqx.Module):
@@ -76,27 +122,52 @@ class Resetting(dfx.AbstractWrappedSolver):
         )
         y1 = self.end_of_step(t0, t1, y0, y1)
         history = solver_state.history
-        found = self._search(terms, t0, t1, y0, y1, dense_info, history)
-        total = jnp.sum(history.happened)
-        exhausted = found.ends_step & (total >= self.max_resets)
-        jumps = found.ends_step & ~exhausted
-        jump = self.jump(terms, jumps, found.number, jnp.asarray(t1), found.time, y1)
-        result = update_result(result, _result(found, jump, exhausted))
-        once = jnp.arange(len(self.conditions), dtype=jnp.int32) == found.number
+        memory = memory_of(inner)
+        met = self._met(terms, t0, t1, y0, y1, memory, dense_info, history)
+        once = jnp.arange(len(self.conditions), dtype=jnp.int32) == met.number
+        jumps = met.ends_step & ~met.exhausted
         happened = history.happened + (once & jumps).astype(jnp.int32)
-        history = History(jumps, found.sides, happened)
-        real = lambda x: jnp.asarray(x, found.target.dtype)
-        report = Report(
-            error,
-            real(found.happens),
-            real(jumps | exhausted),
-            real(found.number),
-            found.target,
-            jump.time,
-            jump.before,
-            jump.after,
-        )
-        return jump.after, report, dense_info, ResetState(inner, history), result
+        history = History(jumps, met.sides, happened)
+        result = update_result(result, met.result)
+        report = Report(error, met._replace(memory=None, defined=1.0))
+        inner = with_memory(inner, met.memory)
+        return met.after, report, dense_info, ResetState(inner, history), result
+
+    def _met(
+        self,
+        terms: Any,
+        t0: Any,
+        t1: Any,
+        y0: Y,
+        y1: Y,
+        memory: Any,
+        dense_info: Any,
+        history: History,
+    ) -> Met:
+        """Look for events in a step, and make the jump of one at its end. Nothing that the search
+        depends on has a derivative."""
+        given = jnp.asarray(t0), jnp.asarray(t1), y0, y1, dense_info, history
+        given = without_derivative(given)
+        held = lambda function: without_derivative(convert_closure(function, *given))(*given)
+
+        def sample(*given: Any) -> tuple[Samples, BoolScalar]:
+            search, step, history = self._search(terms, *given)
+            samples = search.sample(step)
+            return samples, search.may_find(step, samples, history)
+
+        samples, may_find = held(sample)
+        find = lambda *given: _first(*self._search(terms, *given), samples)
+
+        def look() -> Met:
+            found = held(find)
+            exhausted = found.ends_step & (jnp.sum(history.happened) >= self.max_resets)
+            jumps = found.ends_step & ~exhausted
+            jump = self.jump(terms, jumps, found.number, given[1], found.time, y1, memory)
+            return Met.of(found, exhausted, jump)
+
+        idle = Met.without_event(given[1], y1, memory, history)
+        met = lax.cond(may_find, look, lambda: idle)
+        return met._replace(defined=~jnp.any(jnp.isnan(samples.values)))
 
     def end_of_step(self, t0: RealScalarLike, t1: RealScalarLike, y0: Y, y1: Y) -> Y:
         """Return the state at the end of a step; one of negative length only says that an event is at its
@@ -112,44 +183,37 @@ class Resetting(dfx.AbstractWrappedSolver):
         end: FloatScalar,
         time: FloatScalar,
         y: Y,
+        memory: Any,
     ) -> Jump:
         """Return the jump at the end of a step, or the state as it is without one."""
-        return lax.cond(
-            jumps,
-            lambda: jump_at_end(self.conditions, self.inner, terms, number, end, time, y),
-            lambda: Jump(time, y, y, jnp.asarray(True)),
-        )
+
+        def made() -> Jump:
+            jump = jump_at_end(self.conditions, self.inner, terms, number, end, time, y)
+            if memory is None:
+                return jump
+            soon = jump.time + jnp.ones_like(end)
+            inner = self.inner.init(terms, jump.time, soon, jump.after, self.conditions.args)
+            return jump._replace(memory=memory_of(inner))
+
+        return lax.cond(jumps, made, lambda: Jump(time, y, y, jnp.asarray(True), memory))
 
     def _search(
         self, terms: Any, t0: Any, t1: Any, y0: Y, y1: Y, dense_info: Any, history: History
-    ) -> Found:
-        """Look for events in a step; nothing that this depends on has a derivative."""
+    ) -> tuple[EventSearch, SearchedStep, History]:
         direction = time_direction(terms)
-
-        def search(t0, t1, y0, y1, dense_info, history) -> Found:
-            path = self.inner.interpolation_cls(t0=t0, t1=t1, **dense_info)
-            plain = self._plain_solver.interpolation_cls(t0=t0, t1=t1, **dense_info)
-            step = Step(t0, t1, y0, y1, path.evaluate, plain.evaluate)
-            known = self.conditions.next_times(self.t0, history.happened, direction)
-            return Search(
-                lambda t, y: self.conditions.values(t * direction, y),
-                jnp.asarray(self.conditions.directions, t0.dtype),
-                jnp.asarray(self.conditions.is_boolean),
-                self.conditions.samples,
-                self.end,
-                history.happened >= self.conditions.most,
-                known,
-            ).first(step, history)
-
-        given = jnp.asarray(t0), jnp.asarray(t1), y0, y1, dense_info, history
-        given = without_derivative(given)
-        return without_derivative(convert_closure(search, *given))(*given)
-
-    @property
-    def _plain_solver(self) -> Any:
-        if not isinstance(self.inner, AbstractManifoldSolver):
-            return self.inner
-        return eqx.tree_at(lambda s: s.bends_interpolant, self.inner, False)
+        # Interpolation in the fraction of the step: the coefficients of samples are then known numbers.
+        zero, one = np.zeros((), t0.dtype), np.ones((), t0.dtype)
+        path = self.inner.interpolation_cls(t0=zero, t1=one, **dense_info)
+        search = EventSearch(
+            lambda t, y: self.conditions.values(t * direction, y),
+            jnp.asarray(self.conditions.directions, t0.dtype),
+            jnp.asarray(self.conditions.is_boolean),
+            self.conditions.samples,
+            self.end,
+            history.happened >= self.conditions.most,
+            self.conditions.next_times(self.t0, history.happened, direction),
+        )
+        return search, SearchedStep(t0, t1, y0, y1, path.evaluate), history
 
     @property
     def interpolation_cls(self):  # pyright: ignore
@@ -193,7 +257,10 @@ class Resetting(dfx.AbstractWrappedSolver):
         return self.inner.func(terms, t0, y0, args)
 
 
-def _result(found: Found, jump: Jump, exhausted: BoolScalar) -> RESULTS:
-    result = RESULTS.where(jump.success, RESULTS.successful, nonlinear_failure())
-    result = RESULTS.where(exhausted, RESULTS.max_steps_reached, result)  # pyright: ignore[reportArgumentType]
-    return RESULTS.where(found.defined, result, RESULTS.nonfinite_input)  # pyright: ignore[reportArgumentType]
+def _first(search: EventSearch, step: SearchedStep, history: History, samples: Samples) -> Found:
+    return search.first(step, samples, history)
+
+
+def inner_state(solver_state: Any) -> Any:
+    """Return the state of the solver inside, if it is wrapped."""
+    return solver_state.inner if isinstance(solver_state, ResetState) else solver_state

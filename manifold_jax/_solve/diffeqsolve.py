@@ -27,7 +27,7 @@ from .finish import finish
 from .mass_matrix import trusting
 from .output import events_in_true_time, saving
 from .prepare import prepare, time_dtype
-from .resets import finish_resets, Run, with_resets
+from .resets import finish_resets, LoopArguments, with_resets
 from .setup import Consistent, ProblemData, Setup
 from .times import checking_first_step, refusing_missing_times
 
@@ -127,7 +127,7 @@ def diffeqsolve(
     adjoint = CheckedStartAdjoint(adjoint, solver_state is not None, saveat.solver_state)
     if event is not None and event.root_finder is not None:
         adjoint = LocatingAdjoint(adjoint)
-    run = Run(solver, stepsize_controller, saving(setup), ready.solver_state, y0)
+    run = LoopArguments(solver, stepsize_controller, saving(setup), ready.solver_state, y0)
     if solver_state is not None:
         run = run._replace(solver_state=solver_state)
     if resets:

@@ -26,7 +26,7 @@ _TRUE_AT_START = (
 )
 
 
-class Run(NamedTuple):
+class LoopArguments(NamedTuple):
     """What Diffrax is given for a solve."""
 
     solver: dfx.AbstractSolver
@@ -43,8 +43,8 @@ class SolutionWithResets(dfx.Solution):
 
 
 def with_resets(
-    run: Run, resets: Sequence[Reset | ResetAt], max_resets: int, setup: Setup, ready: Ready
-) -> Run:
+    run: LoopArguments, resets: Sequence[Reset | ResetAt], max_resets: int, setup: Setup, ready: Ready
+) -> LoopArguments:
     """Return what Diffrax is given for a solve with resets."""
     t0, t1, _, args = ready.data
     dtype = jnp.result_type(ready.data.direction)
@@ -59,7 +59,7 @@ def with_resets(
     state = None if run.solver_state is None else solver.starting(run.solver_state)
     controller = ResettingController(run.controller, max_resets)
     saveat = eqx.tree_at(lambda s: (s.solver_state, s.controller_state), run.saveat, (True, True))
-    return Run(solver, controller, saveat, state, y0)
+    return LoopArguments(solver, controller, saveat, state, y0)
 
 
 def _with_tolerances(solver: Any, controller: Any) -> Any:

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 
-from ..._adjoint.replay import with_memory
+from ..._solver.step.hook_state import with_memory
 from ..._base.types import BoolScalar, FloatScalar
 from .functions import begin, save, smooth_part, step_state
 from .parts import in_steps, Inputs, Parts

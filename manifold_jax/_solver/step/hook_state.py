@@ -1,5 +1,6 @@
 """The state that all step hooks carry from step to step, and the decision whether a step is rejected."""
 
+import dataclasses
 import functools
 from typing import Any
 
@@ -108,3 +109,14 @@ def _at_least(error: Y, raw: Y, y1: Y, repeatable: BoolScalar) -> Y:
         return jnp.where(repeatable, jnp.maximum(jnp.abs(e), bound), e)
 
     return jtu.tree_map(raised, error, y1, raw)
+
+
+def memory_of(solver_state: Any) -> Any:
+    """Return the memory of a hook without its statistics, which no step depends on."""
+    return solver_state.memory if isinstance(solver_state, HookState) else solver_state
+
+
+def with_memory(solver_state: Any, memory: Any) -> Any:
+    if isinstance(solver_state, HookState):
+        return dataclasses.replace(solver_state, memory=memory)
+    return memory
