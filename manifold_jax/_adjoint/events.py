@@ -1,6 +1,6 @@
 """Location of events after the solve: of several in one step, the first one ends it."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import diffrax as dfx
 import jax
@@ -24,7 +24,7 @@ from .._base.compat import (
 )
 from .._base.types import BoolScalar, FloatScalar, IntScalar, Y
 from .._linalg.newton import root_of_step
-from .._resets.solver import Resetting
+from .._resets.controller import state_of_resets
 from .._solver.base import AbstractManifoldSolver
 
 
@@ -42,7 +42,8 @@ class LocatingAdjoint(dfx.AbstractAdjoint):
         unlocated = dfx.Event(event.cond_fn, None, event.direction)
         final_state, statistics = self.adjoint.loop(event=unlocated, **given)
         progress, old = Progress.of(final_state), Ending.of(final_state)
-        last_step = _EventsInStep(event, LastStep.of(final_state), given)
+        jump = last_jump(final_state)
+        last_step = _EventsInStep(event, LastStep.of(final_state), given, jump)
         located = last_step.happened & (progress.num_steps > 0)
         new = lax.cond(
             unvmap_any(located),
@@ -60,7 +61,9 @@ EVENT_KEYWORDS += ("max_steps",)
 class _EventsInStep:
     """The step in which a solve ended, and the events in it."""
 
-    def __init__(self, event: dfx.Event, step: LastStep, given: dict[str, Any]):
+    def __init__(
+        self, event: dfx.Event, step: LastStep, given: dict[str, Any], jump: "JumpAtEnd | None"
+    ):
         self.args, self.root_finder = given["args"], event.root_finder
         self.given = {name: given[name] for name in EVENT_KEYWORDS}
         self.events = jtu.tree_leaves(event.cond_fn, is_leaf=callable)
@@ -69,23 +72,40 @@ class _EventsInStep:
         self.mask = jnp.stack(jtu.tree_leaves(step.mask))
         self.happened = jnp.any(self.mask)
         self.start = step.start
-        if not isinstance(given["solver"], Resetting):  # the step may begin at an event
+        if jump is None:  # otherwise the step may begin at a reset
             self.start = lax.stop_gradient(step.start)
         self.end = lax.stop_gradient(step.end)
         self.interpolation = given["solver"].interpolation_cls(
             t0=self.start, t1=self.end, **step.dense_info
         )
+        self.jump = jump
 
-    def first(self) -> tuple[FloatScalar, Bool[Array, " events"], RESULTS]:
-        """Return the time of the first event, which one it was, and whether its root was found."""
-        changed = self._changed() if len(self.events) > 1 else self.mask
+    def first(self) -> tuple[FloatScalar, Y, Bool[Array, " events"], RESULTS]:
+        """Return the time of the first event and the state there, which one it was, and whether its root
+        was found. An event whose sign was changed by a reset is at the time of that."""
+        if self.jump is None:
+            changed = self._changed() if len(self.events) > 1 else self.mask
+            return self._first_of(changed)
+        inside = self._changed()
+        jumped = self.jump.at_end & ~jnp.any(inside)
+        t, y, which, result = self._first_of(jnp.where(jumped, self.mask, inside))
+        each = jnp.arange(len(self.events))
+        which = jnp.where(jumped, each == jnp.argmax(self.mask), which)
+        t = jnp.where(jumped, self.jump.time, t)
+        y = jtu.tree_map(lambda a, b: jnp.where(jumped, a, b), self.jump.y, y)
+        return t, y, which, RESULTS.where(jumped, RESULTS.successful, result)
+
+    def _first_of(
+        self, changed: Bool[Array, " events"]
+    ) -> tuple[FloatScalar, Y, Bool[Array, " events"], RESULTS]:
         times, results = jax.vmap(self._root)(jnp.arange(len(self.events)), changed)
         order = jnp.where(changed, lax.stop_gradient(times), jnp.inf)
         i = jnp.argmin(order)
         result = RESULTS.promote(jtu.tree_map(lambda x: x[i], results))
         _, success = self._state(times[i])
         result = update_result(result, RESULTS.where(success, result, nonlinear_failure()))
-        return times[i], jnp.arange(len(self.events)) == i, result
+        y = self.interpolation.evaluate(times[i])
+        return times[i], y, jnp.arange(len(self.events)) == i, result
 
     def _state(self, t: FloatScalar) -> tuple[Y, BoolScalar | bool]:
         """Return the state on the manifold, and whether it could be moved there."""
@@ -119,8 +139,15 @@ class _EventsInStep:
             return (before <= 0) & (after > 0) if direction else (before > 0) & (after <= 0)
 
         before = self._values(self.start)
-        each = zip(before, self.after, self.directions, strict=True)
-        return jnp.stack([has(*of) for of in each]) | self.mask
+        if self.jump is None:
+            each = zip(before, self.after, self.directions, strict=True)
+            return jnp.stack([has(*of) for of in each]) | self.mask
+        # Before the jump; a Boolean condition ends the solve after it.
+        end = zip(self._values(self.end), self.after, strict=True)
+        at_end = self.jump.at_end
+        after = [a if a.dtype == bool else jnp.where(at_end, v, a) for v, a in end]
+        each = zip(before, after, self.directions, strict=True)
+        return jnp.stack([has(*of) for of in each]) & (self.mask | at_end)
 
     def _root(self, i: IntScalar, changed: BoolScalar) -> tuple[FloatScalar, optx.RESULTS]:
         def value(t, _):  # its root is the end of the step if the event has not happened
@@ -138,12 +165,30 @@ class _EventsInStep:
         return root_of_step(convert_closure(step, at), at), root.result
 
 
+class JumpAtEnd(NamedTuple):
+    """Whether the last step of a solve ended with a reset, and then its time and the state after it."""
+
+    at_end: BoolScalar
+    time: FloatScalar
+    y: Y
+
+
+def last_jump(final_state: Any) -> JumpAtEnd | None:
+    progress = Progress.of(final_state)
+    resets = state_of_resets(progress.controller_state)
+    if resets is None:
+        return None
+    last = jnp.maximum(resets.record.number - 1, 0)
+    times = resets.record.rows[0]
+    at_end = progress.solver_state.history.after_reset & (resets.record.number > 0)
+    return JumpAtEnd(at_end, times[last], progress.y)
+
+
 def _ending(
     old: Ending, num_accepted: IntScalar, last_step: _EventsInStep, located: BoolScalar
 ) -> Ending:
     """Return how the solve ends with its first event, if there is one."""
-    t, first, found = last_step.first()
-    y = last_step.interpolation.evaluate(t)
+    t, y, first, found = last_step.first()
     mask = jtu.tree_unflatten(jtu.tree_structure(old.event_mask), list(first))
 
     def saved(sub: dfx.SubSaveAt, state: SaveState) -> SaveState:

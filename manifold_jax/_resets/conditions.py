@@ -71,22 +71,27 @@ class Conditions(eqx.Module):
         return jnp.stack([value(*of) for of in zip(self.resets, self.is_boolean, strict=True)])
 
     def distance(self, number: IntScalar, t: FloatScalar, y: Y) -> FloatScalar:
-        """Return a function whose zero near `t` is the time of the event `number`, with derivatives; of
-        a Boolean condition zero."""
+        """Return a function of `t` and `y` that is zero at the event `number`; for a Boolean condition it is
+        zero everywhere."""
 
         def of(reset: Reset | ResetAt, boolean: bool) -> Any:
             if isinstance(reset, ResetAt):
                 times = reset.times.astype(t.dtype)
                 nearest = jnp.argmin(jnp.abs(jax.lax.stop_gradient(times - t)))
                 return lambda t, y: t - times[nearest]
-            if boolean and _depends_on_state(reset, t, y, self.args):
-                return lambda t, y: jnp.zeros_like(t) * _fixed(y).astype(t.dtype)
             if boolean:
                 return lambda t, y: jnp.zeros_like(t)
             return lambda t, y: jnp.asarray(reset.condition(t, y, self.args)).astype(t.dtype)
 
         branches = [of(*pair) for pair in zip(self.resets, self.is_boolean, strict=True)]
         return jax.lax.switch(number, branches, t, y)
+
+    def refuse_derivative(self, t: FloatScalar, y: Y) -> Y:
+        """Return `y`, with an error if it is differentiated, if a Boolean condition depends on the state."""
+        kinds = zip(self.resets, self.is_boolean, strict=True)
+        if any(boolean and _depends_on_state(r, t, y, self.args) for r, boolean in kinds):
+            return nondifferentiable(y, msg=_NO_DERIVATIVE)
+        return y
 
     def jump(self, number: IntScalar, t: FloatScalar, y: Y) -> Y:
         def of(reset: Reset | ResetAt) -> Any:
@@ -115,11 +120,6 @@ class Conditions(eqx.Module):
     def true_at_start(self, t: RealScalarLike, y: Y) -> Bool[Array, " resets"]:
         """Return which Boolean conditions are true at the start."""
         return (self.values(jnp.asarray(t), y) > 0) & jnp.asarray(self.is_boolean)
-
-
-def _fixed(y: Y) -> Array:
-    leaves = [jnp.sum(leaf) for leaf in jtu.tree_leaves(nondifferentiable(y, msg=_NO_DERIVATIVE))]
-    return jnp.zeros_like(leaves[0])
 
 
 def _is_boolean(i: int, reset: Reset | ResetAt, t: RealScalarLike, y: Y, args: Args) -> bool:

@@ -65,6 +65,7 @@ def _time_and_state_of_event(
     distance = lambda t, y: conditions.distance(number, t * direction, y)
     rate = jax.jvp(distance, (end, y), (jnp.ones_like(end), field(end, y)))[1]
     rate = lax.stop_gradient(jnp.where(rate == 0, 1, rate))
+    y = conditions.refuse_derivative(end, y)
 
     def flow(d: FloatScalar) -> Y:
         moved = lambda y0, f: jtu.tree_map(lambda a, b: a + (d * b).astype(a.dtype), y0, f)

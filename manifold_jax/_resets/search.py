@@ -48,10 +48,14 @@ class History(eqx.Module):
     # for the one that caused it, which may have any sign after it.
     sides: Float[Array, " resets"]
     happened: Int[Array, " resets"]  # how often each has happened
+    irregular: IntScalar  # how many had no derivative
+    failed: BoolScalar  # whether the state after the last jump could not be used
 
     @staticmethod
     def initial(count: int, dtype: Any) -> "History":
-        return History(jnp.asarray(True), jnp.zeros(count, dtype), jnp.zeros(count, jnp.int32))
+        never, zero = jnp.zeros(count, jnp.int32), jnp.zeros((), jnp.int32)
+        sides = jnp.zeros(count, dtype)
+        return History(jnp.asarray(True), sides, never, zero, jnp.asarray(False))
 
 
 class Samples(NamedTuple):
@@ -79,6 +83,7 @@ class Found(NamedTuple):
 
     happens: BoolScalar
     ends_step: BoolScalar  # whether this step ends there
+    irregular: BoolScalar  # whether it has no derivative: several at one time, or only touched
     number: IntScalar  # of the reset
     target: FloatScalar  # where a step has to end so that the event is at its end
     time: FloatScalar  # of the event, if it is at the end of this step
@@ -139,11 +144,13 @@ class EventSearch(NamedTuple):
         at_end = roots >= self.end - 200 * rounding  # of the solve, where nothing happens any more
         roots = jnp.where(self.ignored | at_end | is_far, jnp.inf, roots)
         near = self._is_at_end(step, samples, roots, noise, rounding) & ~at_once
-        return self._chosen(step, samples, roots, near, at_once, signs, place)
+        irregular = self._is_irregular(samples, near, at_once & on_surface)
+        return self._chosen(step, samples, roots, near, at_once, irregular, signs, place)
 
     def _crosses(self, before: Array, after: Array) -> Array:
         up, down = (before < 0) & (after >= 0), (before > 0) & (after <= 0)
-        return (up & (self.directions >= 0)) | (down & (self.directions <= 0))
+        directions = jnp.broadcast_to(self.directions, up.shape)
+        return (up & (directions >= 0)) | (down & (directions <= 0))
 
     def _start(self, samples: Samples, history: History, noise: Array) -> tuple[Array, ...]:
         """Return the signs just before and just after the start of the step, and which conditions are
@@ -153,7 +160,10 @@ class EventSearch(NamedTuple):
         on_surface = history.after_reset & is_zero(samples.values[0])
         on_surface &= ~self.is_boolean & ~self.is_known
         change = samples.values[-1] - samples.values[0]
-        change = jnp.where(jnp.abs(change) <= 1e-10 * _JUST_AFTER * largest, 0, change)
+        # At rest it changes with the square of the time.
+        least = 30 * _JUST_AFTER * jnp.abs(samples.values[1]) * self.parts
+        least = jnp.maximum(least, 1e-10 * largest) * _JUST_AFTER
+        change = jnp.where(jnp.abs(change) <= least, 0, change)
         start = jnp.sign(jnp.where(on_surface, change, samples.values[0]))
         # One that was zero before the jump as well is taken to have been on the side it can leave.
         touching = jnp.where(on_surface, -self.directions, 0)
@@ -168,11 +178,11 @@ class EventSearch(NamedTuple):
         def perturbed(leaf: Array) -> Array:
             signs = random.choice([-1.0, 1.0], (_PERTURBATIONS, *leaf.shape))
             eps = 16 * jnp.finfo(leaf.dtype).eps
-            return leaf * (1 + eps * jnp.asarray(signs, leaf.dtype))
+            return leaf[None] * (1 + eps * jnp.asarray(signs, leaf.dtype))
 
         states = jtu.tree_map(perturbed, step.y1)
         values = jax.vmap(lambda y: self.values(step.t1, y))(states)
-        change = jnp.max(jnp.abs(values - samples.end), axis=0)
+        change = jnp.max(jnp.abs(values - samples.end[None]), axis=0)
         return jnp.where(self.is_boolean, 0, change)
 
     def _roots(
@@ -206,6 +216,14 @@ class EventSearch(NamedTuple):
         tolerance = jnp.where(self.is_known, 4 * rounding, tolerance)
         return jnp.abs(roots - step.t1) <= tolerance
 
+    def _is_irregular(self, samples: Samples, near: Array, touching: Array) -> Array:
+        """Return which events have no derivative: more than one at a time, or zeros with almost no slope."""
+        slope = jnp.abs(samples.in_order[-1] - samples.end) / _BEYOND
+        grazes = slope <= 1e-3 * jnp.max(jnp.abs(samples.inside), axis=0)
+        several = jnp.sum(near & ~self.is_known) > 1
+        grazes &= ~self.is_boolean & ~self.is_known
+        return jnp.where(near, grazes | several, touching)
+
     def _chosen(
         self,
         step: SearchedStep,
@@ -213,6 +231,7 @@ class EventSearch(NamedTuple):
         roots: Array,
         near: Array,
         at_once: Array,
+        irregular: Array,
         signs: Array,
         place: Array,
     ) -> Found:
@@ -228,15 +247,17 @@ class EventSearch(NamedTuple):
         sides = jnp.where(near, infinite(signs[place, jnp.arange(place.size)]), samples.end)
         target = jnp.maximum(_before(earliest), _after(step.t0))
         unit = _unit(step.t0)
-        back = step.t0 - (number + 1).astype(unit.dtype) * unit
-        target = jnp.where(at_once[number], back, target)
+        code = number + 1 + place.size * irregular[number].astype(number.dtype)
+        target = jnp.where(at_once[number], step.t0 - code.astype(unit.dtype) * unit, target)
         # A step of negative length is one that says which event happens at its start.
         told = jnp.round((step.t0 - step.t1) / unit).astype(jnp.int32) - 1
         is_told = step.is_negative
-        number = jnp.where(is_told, jnp.clip(told, 0, place.size - 1), number)
+        told_irregular = told >= place.size
+        number = jnp.where(is_told, jnp.clip(told % place.size, 0, place.size - 1), number)
         return Found(
             happens | is_told,
             is_at_end | is_told,
+            jnp.where(is_told, told_irregular, irregular[number]),
             number,
             target,
             jnp.where(is_told, step.t0, _after(step.t1)),

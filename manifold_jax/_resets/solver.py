@@ -36,13 +36,14 @@ class Met(NamedTuple):
     @staticmethod
     def of(found: Found, exhausted: BoolScalar, jump: Jump) -> "Met":
         real = lambda x: jnp.asarray(x, found.target.dtype)
-        numbers = found.happens, found.ends_step, exhausted, found.number, jump.success
+        flags = found.happens, found.ends_step, exhausted
+        numbers = *flags, found.number, jump.success, found.irregular
         numbers = jnp.stack([found.target, *map(real, numbers)])
         return Met(numbers, found.sides, jump.time, jump.before, jump.after, jump.memory)
 
     @staticmethod
     def without_event(t: FloatScalar, y: Y, memory: Any, history: History) -> "Met":
-        numbers = jnp.asarray([0, 0, 0, 0, 0, 1], t.dtype)
+        numbers = jnp.asarray([0, 0, 0, 0, 0, 1, 0], t.dtype)
         return Met(numbers, history.sides, t, y, y, memory)
 
     @property
@@ -66,8 +67,16 @@ class Met(NamedTuple):
         return self.numbers[4].astype(jnp.int32)
 
     @property
+    def usable(self) -> BoolScalar:
+        return self.numbers[5] > 0
+
+    @property
+    def irregular(self) -> BoolScalar:
+        return self.numbers[6] > 0
+
+    @property
     def result(self) -> RESULTS:
-        success = RESULTS.where(self.numbers[5] > 0, RESULTS.successful, nonlinear_failure())
+        success = RESULTS.where(self.usable, RESULTS.successful, nonlinear_failure())
         result = RESULTS.where(self.exhausted, RESULTS.max_steps_reached, success)  # pyright: ignore[reportArgumentType]
         return RESULTS.where(self.defined, result, RESULTS.nonfinite_input)  # pyright: ignore[reportArgumentType]
 
@@ -127,7 +136,8 @@ class Resetting(dfx.AbstractWrappedSolver):
         once = jnp.arange(len(self.conditions), dtype=jnp.int32) == met.number
         jumps = met.ends_step & ~met.exhausted
         happened = history.happened + (once & jumps).astype(jnp.int32)
-        history = History(jumps, met.sides, happened)
+        irregular = history.irregular + (jumps & met.irregular).astype(jnp.int32)
+        history = History(jumps, met.sides, happened, irregular, jumps & ~met.usable)
         result = update_result(result, met.result)
         report = Report(error, met._replace(memory=None, defined=1.0))
         inner = with_memory(inner, met.memory)

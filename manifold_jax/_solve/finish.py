@@ -1,5 +1,6 @@
 """Postprocessing of a solve: output on the manifold, statistics, and the result."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import diffrax as dfx
@@ -7,6 +8,7 @@ import equinox as eqx
 from diffrax import RESULTS
 
 from .._base.compat import is_okay, nonlinear_failure, update_result
+from .._base.types import BoolScalar
 from .._constraint.constraint import AbstractConstraint
 from .._rosenbrock import MassMatrixTerm
 from .._solver.base import AbstractManifoldSolver
@@ -18,15 +20,19 @@ from .setup import Setup
 
 
 def finish(
-    setup: Setup, ready: Ready, sol: dfx.Solution, constraint: AbstractConstraint | None
+    setup: Setup,
+    ready: Ready,
+    sol: dfx.Solution,
+    constraint: AbstractConstraint | None,
+    faults: Sequence[tuple[BoolScalar, str]] = (),
 ) -> dfx.Solution:
     """Correct the saved values and report the solve; with `throw` raise if it failed. `constraint` is
-    held by the dense solution."""
+    held by the dense solution; `faults` are further causes of a failure, with their messages."""
     is_hook = isinstance(setup.solver, AbstractManifoldSolver)
     report = _corrected(setup, ready, sol, constraint) if is_hook else _checked(setup, ready, sol)
     if not setup.throw:
         return report
-    faults = tangency_fault(setup.solver, report, sol.solver_state)
+    faults = [*tangency_fault(setup.solver, report, sol.solver_state), *faults]
     # A bad start has raised its own, more precise error.
     failed = ~is_okay(report.result) & ready.start.success
     return raise_if_failed(report, failed, setup.solver, faults)

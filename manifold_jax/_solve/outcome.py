@@ -33,7 +33,7 @@ _NOT_FINITE = (
     "`mj.MechanicalSystem` the mass matrix is not positive definite there, or constraints depend on each other."
 )
 _NAN_INSIDE = (
-    "The search for the time of an event, or for a stage of an implicit method, met NaN: the function in `event` or the "
+    "The search for an event, or for a stage of an implicit method, met NaN: a function in `event` or `resets` or the "
     "vector field in `terms` is not defined near the step."
 )
 NO_TIME = "`t0` or `t1` is NaN (or `t0` infinite): nothing was solved."

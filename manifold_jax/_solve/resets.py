@@ -25,6 +25,15 @@ _TRUE_AT_START = (
     "is meant to happen at the start, or write a condition that is false there."
 )
 
+_TOO_MANY = (
+    "There were more events than `max_resets`. If they come closer and closer to each other (a bouncing ball at rest), "
+    "let a terminating `event` or another condition take over; otherwise increase `max_resets`."
+)
+_NO_STATE_AFTER = (
+    "The state that a `jump` in `resets` returned is not finite, or could not be moved onto the manifold: no nearby state "
+    "satisfies the equations of `constraint`. Return a state that does."
+)
+
 
 class LoopArguments(NamedTuple):
     """What Diffrax is given for a solve."""
@@ -86,7 +95,11 @@ def finish_resets(
     where = lambda s: (s.solver_state, s.controller_state)
     kept = controller_state.inner if keeps_controller_state else None
     sol = eqx.tree_at(where, sol, (state.inner, kept), is_leaf=lambda x: x is None)
-    sol = finish(setup, ready, sol, constraint)
+    stats = {**sol.stats, "num_nondifferentiable_resets": state.history.irregular}
+    sol = eqx.tree_at(lambda s: s.stats, sol, stats)
+    too_many = controller_state.record.number > resets.times.size
+    faults = [(too_many, _TOO_MANY), (state.history.failed, _NO_STATE_AFTER)]
+    sol = finish(setup, ready, sol, constraint, faults)
     fields = {name: getattr(sol, name) for name in dfx.Solution.__dataclass_fields__}
     if not setup.saveat.solver_state:
         fields["solver_state"] = None
