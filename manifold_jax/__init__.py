@@ -31,6 +31,7 @@ from ._fit import FitResult as FitResult
 from ._fit.fit import fit as fit
 from ._mechanics import (
     Baumgarte as Baumgarte,
+    impact as impact,
     MechanicalSystem as MechanicalSystem,
     VelocityStabilization as VelocityStabilization,
 )
