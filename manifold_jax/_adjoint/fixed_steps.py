@@ -38,7 +38,9 @@ def with_sizes_held_fixed(
 ) -> dfx.AbstractStepSizeController:
     """Return a controller whose step sizes have no derivatives; the times of events have."""
     if isinstance(controller, ResettingController):
-        return eqx.tree_at(lambda c: c.controller, controller, SizesHeldFixed(controller.controller))
+        return eqx.tree_at(
+            lambda c: c.controller, controller, SizesHeldFixed(controller.controller)
+        )
     return SizesHeldFixed(controller)
 
 

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 
 from .._base.compat import buffer_at_set, MaybeBuffer, Progress, unvmap_max, while_loop
 from .._base.types import IntScalar
-from .._resets.controller import state_of_resets
+from .._resets.controller import record_of_resets
 
 
 # Blocks have `_FEWEST` steps if their states then take at most `_SMALL` bytes: XLA for CPUs runs the
@@ -176,7 +176,7 @@ def recording(record: Record, of: Callable[[Any], Any], run: Callable) -> tuple[
             if record.jumps:
                 row.append(jnp.asarray(now.made_jump, now.tprev.dtype))
             if record.resets:
-                before, after = (state_of_resets(p.controller_state).record for p in (now, end))
+                before, after = (record_of_resets(p.controller_state) for p in (now, end))
                 which = after.indices[before.number]
                 which = jnp.where(after.number > before.number, which, -1)
                 row.append(which.astype(now.tprev.dtype))

@@ -16,7 +16,7 @@ from .._base.compat import Differentiable, LoopState, Progress, start_of_last, w
 from .._base.types import Args, FloatScalar, IntScalar, RealScalarLike, Y
 from .._constraint.projection_info import ProjectionInfo
 from .._resets.controller import ResettingController, state_of_resets
-from .._resets.solver import inner_state, ResetState, Resetting
+from .._resets.solver import inner_state, ResetState, Resetting, with_end
 from .._solver.base import AbstractManifoldSolver
 from .._solver.step.execution import execution_of, ExplicitStep
 from .._solver.step.frame import StepFrame
@@ -71,6 +71,8 @@ class Replay(eqx.Module):
         def step(start, end, jumped, reset, state):
             after, dense_info = solve.attempt(start, end, jumped, state)
             after, event = solve.reset(start, end, reset, state, after)
+            if solve.resetting is not None:
+                dense_info = with_end(dense_info, end)
             return after, dense_info if interpolates else None, event
 
         jumped, reset = t != t if solve.jumps else False, None
@@ -85,7 +87,8 @@ class Replay(eqx.Module):
                 return sub.fn(t, y, solve.args)
 
             def in_step(t, start, end, dense_info):
-                interpolation = solve.solver.interpolation_cls(t0=start, t1=end, **dense_info)
+                solver = solve.solver if solve.resetting is None else solve.resetting
+                interpolation = solver.interpolation_cls(t0=start, t1=end, **dense_info)
                 return at_state(t, interpolation.evaluate(t))
 
             times = t, t, t

@@ -139,9 +139,7 @@ class ReverseSweep(eqx.Module):
             return replay.step(*ends, step.begins_at_jump, step.reset, state)
 
         times, ends = gradient.times, (step.start, step.end)
-        (after, dense_info, _), pullback = self.functions.vjp(
-            out, smooth, ends, gradient.is_timed
-        )
+        (after, dense_info, _), pullback = self.functions.vjp(out, smooth, ends, gradient.is_timed)
         new = gradient
         for k in range(len(self.functions.rest.savings)):
             new = self.saved.after_step(new, k, step, after.y)
@@ -168,10 +166,11 @@ class ReverseSweep(eqx.Module):
     def _of_event(self, gradient: Gradient, step: RecordedStep) -> tuple[Any, IntScalar | None]:
         """Return the cotangents of the event at the end of a step, which is the start of the step
         after it, and the number of resets before it."""
-        if self.resets is None:
+        if self.resets is None or step.reset is None:
             return None, None
-        is_event = step.reset >= 0  # pyright: ignore[reportOptionalOperand]
-        row = gradient.resets - 1  # pyright: ignore[reportOptionalOperand]
+        assert gradient.start is not None
+        assert gradient.resets is not None
+        is_event, row = step.reset >= 0, gradient.resets - 1
         of_row = lambda b: jnp.where(is_event, b[jnp.maximum(row, 0)], 0)
         time, before, after = jtu.tree_map(of_row, self.resets.rows)
         time += jnp.where(is_event, gradient.start, 0)

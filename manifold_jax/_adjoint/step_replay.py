@@ -236,7 +236,9 @@ def _gradient(differentiable, is_perturbed, values, cotangents_out):
     saved = SavedValues(functions, ends, _rows(replay, save_states(final_state), bar, ends))
     resets = state_of_resets(end.controller_state)
     if resets is not None:
-        resets = ResetBars(resets.record.number, bar.resets.rows, bar.dense_ts, bar.resets.last_start)
+        resets = ResetBars(
+            resets.record.number, bar.resets.rows, bar.dense_ts, bar.resets.last_start
+        )
     back = ReverseSweep(functions, record, start, ends, saved, dense, resets)
     last_bar = State(bar.y, bar.solver_state)
     gradient = back.run(last_bar, timed=any(jtu.tree_leaves(is_perturbed[2])))

@@ -126,7 +126,7 @@ def sources(
     return which, evaluated(equation.primitive, params, operands)
 
 
-def arranged_factors(equation: Any, factors: Sequence[np.ndarray]) -> list[np.ndarray]:
+def arranged_factors(equation: Any, factors: Sequence[Any]) -> list[Any]:
     """Return the factors of a `dot_general` with their axes rearranged: one that both have in common,
     one of the factor's own, one that is summed over, and trailing ones absent in arrays of numbers."""
     out = []

@@ -4,8 +4,8 @@ from collections.abc import Callable
 from typing import Any
 
 import jax
+import jax.core
 import jax.numpy as jnp
-
 
 from .._base.types import Args, RealScalarLike, Y
 from .._base.user_functions import check_function
@@ -90,7 +90,7 @@ def _after_impact(
     y: Y,
     args: Args,
 ) -> Y:
-    q, v = y[:2]
+    q = y[0]
 
     def positions(t: RealScalarLike, q: Y, args: Args) -> Any:
         own = () if system.holonomic is None else system.holonomic(t, q, args)

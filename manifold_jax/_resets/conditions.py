@@ -102,7 +102,7 @@ class Conditions(eqx.Module):
         return jax.lax.switch(number, [of(reset) for reset in self.resets], t, y)
 
     def next_times(
-        self, t0: FloatScalar, happened: Int[Array, " resets"], direction: FloatScalar
+        self, t0: FloatScalar, happened: Int[Array, " resets"], direction: RealScalarLike
     ) -> Float[Array, " resets"]:
         """Return the next of the known times of each reset, in the time of Diffrax; infinity for
         conditions, and after the last one. `t0` is the start of the solve."""
@@ -132,11 +132,12 @@ def _is_boolean(i: int, reset: Reset | ResetAt, t: RealScalarLike, y: Y, args: A
             f"`resets[{i}].condition` must return one real number (or a Boolean), got {shapes(out)}."
         )
     dtype = jnp.result_type(leaves[0])
-    if dtype != bool and not jnp.issubdtype(dtype, jnp.floating):
+    is_boolean = jnp.issubdtype(dtype, jnp.bool_)
+    if not is_boolean and not jnp.issubdtype(dtype, jnp.floating):
         raise TypeError(
             f"`resets[{i}].condition` must return one real number (or a Boolean), got the dtype {dtype}."
         )
-    return dtype == bool
+    return is_boolean
 
 
 def _check_jump(i: int, reset: Reset | ResetAt, t: RealScalarLike, y: Y, args: Args) -> None:
@@ -153,7 +154,7 @@ def _check_jump(i: int, reset: Reset | ResetAt, t: RealScalarLike, y: Y, args: A
             )
 
 
-def _depends_on_state(reset: Reset, t: FloatScalar, y: Y, args: Args) -> bool:
+def _depends_on_state(reset: Any, t: FloatScalar, y: Y, args: Args) -> bool:
     """Whether the condition is a function of more than the time and constants."""
     arrays, static = eqx.partition((y, args), eqx.is_array)
     leaves, tree = jtu.tree_flatten(arrays)

@@ -47,9 +47,11 @@ class ResettingController(dfx.AbstractStepSizeController):
         )
         at_event = keep & met.ends_step
         repeated = keep & met.happens & ~at_event
-        resumed = at_event & (state.shortened > 0)
         # Sizes have no derivatives; the time of the event has one.
         time, length = lax.stop_gradient((met.time, t1 - t0))
+        resumed = at_event & (state.shortened > 0)
+        if self._has_prescribed_times:
+            resumed &= state.shortened_end > time
         following = jnp.where(resumed, self._resumed(state, time, next_t1), next_t1)
         following = jnp.where(at_event, jnp.maximum(following, time), following)
         next_t0 = jnp.where(repeated, t0, jnp.where(at_event, met.time, next_t0))
@@ -69,12 +71,16 @@ class ResettingController(dfx.AbstractStepSizeController):
     def _is_clipped(self) -> bool:
         return isinstance(_innermost(self.controller), dfx.ClipStepSizeController)
 
+    @property
+    def _has_prescribed_times(self) -> bool:
+        return isinstance(_innermost(self.controller), dfx.ConstantStepSize | dfx.StepTo)
+
     def _resumed(self, state: ResettingState, time: FloatScalar, suggested: Any) -> FloatScalar:
         """Return the end of the step after an event: as long as the one that was shortened for it, or with
         prescribed times of steps to the same end."""
         if self._is_clipped:
             return suggested
-        if isinstance(_innermost(self.controller), dfx.ConstantStepSize | dfx.StepTo):
+        if self._has_prescribed_times:
             return state.shortened_end
         return time + state.shortened
 
@@ -95,3 +101,8 @@ def _where(condition: Any, a: Any, b: Any) -> Any:
 def state_of_resets(controller_state: Any) -> ResettingState | None:
     """Return the state of the controller of a solve with resets."""
     return controller_state if isinstance(controller_state, ResettingState) else None
+
+
+def record_of_resets(controller_state: Any) -> ResetRecord:
+    assert isinstance(controller_state, ResettingState)
+    return controller_state.record

@@ -70,7 +70,7 @@ def _time_and_state_of_event(
     def flow(d: FloatScalar) -> Y:
         moved = lambda y0, f: jtu.tree_map(lambda a, b: a + (d * b).astype(a.dtype), y0, f)
 
-        def stage(middle: Y, _: None) -> tuple[Y, Y]:
+        def stage(middle: tuple[Y, FloatScalar], _: Any) -> tuple[tuple[Y, FloatScalar], Y]:
             """Evaluate the field first at the start, then in the middle."""
             at, fraction = middle
             velocity = field(end + fraction * d, at)
@@ -80,7 +80,7 @@ def _time_and_state_of_event(
         _, velocities = lax.scan(stage, (y, jnp.zeros_like(d)), None, length=2)
         return moved(y, jtu.tree_map(lambda v: v[1], velocities))
 
-    def iterate(carry: tuple, _: None) -> tuple[tuple, None]:
+    def iterate(carry: tuple, _: Any) -> tuple[tuple, None]:
         following, *_ = carry
         state = flow(following)
         value = distance(end + following, state)

@@ -57,7 +57,7 @@ class ResetRecord(eqx.Module):
         number = jnp.minimum(self.number, count)
         used = jnp.arange(count, dtype=number.dtype) < number
 
-        def only_used(x: Array, empty: float) -> Array:
+        def only_used(x: Array, empty: Any) -> Array:
             where = used.reshape(-1, *[1] * (x.ndim - 1))
             return jnp.where(where, x[:count], jnp.asarray(empty, x.dtype))
 

@@ -101,7 +101,7 @@ class ResetAt(eqx.Module):
         self.jump = jump
 
 
-def check_resets(resets: Any, max_resets: Any) -> None:
+def check_resets(resets: Any, max_resets: Any, controller_state: Any) -> None:
     if not isinstance(resets, tuple | list):
         raise TypeError(
             f"`resets` must be a tuple of `mj.Reset` and `mj.ResetAt`, got {type(resets).__name__}. Write "
@@ -115,6 +115,10 @@ def check_resets(resets: Any, max_resets: Any) -> None:
             )
     if not isinstance(max_resets, int) or isinstance(max_resets, bool) or max_resets < 1:
         raise ValueError(f"`max_resets` must be a positive integer, got {max_resets!r}.")
+    if resets and controller_state is not None:
+        raise ValueError(
+            "`controller_state` cannot be passed to a solve with `resets`, whose steps are chosen anew after each."
+        )
 
 
 def _described(x: Any) -> str:

@@ -115,7 +115,12 @@ class EventSearch(NamedTuple):
         join = lambda ys, y0, y1: jnp.concatenate([y0[None], ys[1:n], y1[None], ys[n + 1 :]])
         states = jtu.tree_map(join, states, step.y0, step.y1)
         times = step.t0 + step.length * where
-        return Samples(fractions, jax.vmap(self.values)(times, states))
+        values = jax.vmap(self.values)(times, states)
+        # One that touches zero only just has no other sign near by.
+        size = jnp.max(jnp.abs(values[1:n]), axis=0) if n > 1 else jnp.abs(values[0])
+        nothing = 4 * jnp.finfo(values.dtype).eps * size
+        end = jnp.where(jnp.abs(values[n]) <= nothing, 0, values[n])
+        return Samples(fractions, jnp.concatenate([values[:n], end[None], values[n + 1 :]]))
 
     def may_find(self, step: SearchedStep, samples: Samples, history: History) -> BoolScalar:
         """Whether the step needs to be looked at: most steps have no event."""
@@ -130,7 +135,7 @@ class EventSearch(NamedTuple):
         before, start, on_surface = self._start(samples, history, noise)
         # A jump changed the sign, or the state leaves the surface on which it began: at once.
         leaves = (before != 0) & (start != 0) & self._crosses(before, start)
-        first = jnp.sign(samples.values[1])
+        first = jnp.where(jnp.abs(samples.values[1]) > 4 * noise, jnp.sign(samples.values[1]), 0)
         rests = on_surface & (start == 0) & self._crosses(-first, first)
         at_once = jnp.where(self.is_known, self.known_times <= step.t0, leaves | rests)
         signs = jnp.sign(samples.in_order).at[0].set(start)
@@ -145,7 +150,7 @@ class EventSearch(NamedTuple):
         roots = jnp.where(self.ignored | at_end | is_far, jnp.inf, roots)
         near = self._is_at_end(step, samples, roots, noise, rounding) & ~at_once
         irregular = self._is_irregular(samples, near, at_once & on_surface)
-        return self._chosen(step, samples, roots, near, at_once, irregular, signs, place)
+        return self._chosen(step, samples, history, roots, near, at_once, irregular, signs, place)
 
     def _crosses(self, before: Array, after: Array) -> Array:
         up, down = (before < 0) & (after >= 0), (before > 0) & (after <= 0)
@@ -228,6 +233,7 @@ class EventSearch(NamedTuple):
         self,
         step: SearchedStep,
         samples: Samples,
+        history: History,
         roots: Array,
         near: Array,
         at_once: Array,
@@ -253,6 +259,7 @@ class EventSearch(NamedTuple):
         told = jnp.round((step.t0 - step.t1) / unit).astype(jnp.int32) - 1
         is_told = step.is_negative
         told_irregular = told >= place.size
+        waiting = jnp.where(jnp.isinf(history.sides), history.sides, samples.end)
         number = jnp.where(is_told, jnp.clip(told % place.size, 0, place.size - 1), number)
         return Found(
             happens | is_told,
@@ -261,7 +268,7 @@ class EventSearch(NamedTuple):
             number,
             target,
             jnp.where(is_told, step.t0, _after(step.t1)),
-            jnp.where(is_told, infinite(signs[0]), sides).at[number].set(jnp.nan),
+            jnp.where(is_told, waiting, sides).at[number].set(jnp.nan),
         )
 
 

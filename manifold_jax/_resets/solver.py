@@ -1,5 +1,6 @@
 """A solver whose steps end at events, where the state jumps."""
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import diffrax as dfx
@@ -96,6 +97,21 @@ class ResetState(eqx.Module):
     history: History
 
 
+class InterpolationToEnd(eqx.Module):
+    """Builds the interpolation of a step from its `dense_info`, with the `end` in it: the dense solution
+    knows the time of an event instead, which has a derivative, while ends of steps are held fixed."""
+
+    inner: Callable[..., dfx.AbstractLocalInterpolation] = eqx.field(static=True)
+
+    def __call__(self, *, t0, t1, end, **info) -> dfx.AbstractLocalInterpolation:
+        del t1
+        return self.inner(t0=t0, t1=end, **info)
+
+
+def with_end(dense_info: dict[str, Any], end: RealScalarLike) -> dict[str, Any]:
+    return dict(end=jnp.asarray(end), **dense_info)
+
+
 class Resetting(dfx.AbstractWrappedSolver):
     """A solver, of Diffrax or a step hook, whose state jumps at events.
 
@@ -141,6 +157,7 @@ class Resetting(dfx.AbstractWrappedSolver):
         result = update_result(result, met.result)
         report = Report(error, met._replace(memory=None, defined=1.0))
         inner = with_memory(inner, met.memory)
+        dense_info = with_end(dense_info, t1)
         return met.after, report, dense_info, ResetState(inner, history), result
 
     def _met(
@@ -227,7 +244,7 @@ class Resetting(dfx.AbstractWrappedSolver):
 
     @property
     def interpolation_cls(self):  # pyright: ignore
-        return self.inner.interpolation_cls
+        return InterpolationToEnd(self.inner.interpolation_cls)
 
     # Diffrax looks at the type and at some attributes of the innermost solver.
     @property

@@ -1,6 +1,5 @@
 """The front end: `diffrax.diffeqsolve` plus what a solver cannot do on its own."""
 
-from collections.abc import Sequence
 from typing import Any
 
 import diffrax as dfx
@@ -11,7 +10,7 @@ from .._base.errors import clear_errors
 from .._base.numbers import numbers_as_arrays
 from .._base.types import Args, RealScalarLike, Y
 from .._base.user_functions import evaluated
-from .._resets.reset import check_resets, Reset, ResetAt
+from .._resets.reset import check_resets
 from .._solver.base import AbstractManifoldSolver
 from .._solver.step.implicit import with_accurate_stages, with_tolerances_of_stages
 from .arguments import (
@@ -58,7 +57,7 @@ def diffeqsolve(
     controller_state: Any = None,
     made_jump: Any = None,
     consistent: Consistent = "project",
-    resets: Sequence[Reset | ResetAt] = (),
+    resets: Any = (),
     max_resets: int = 100,
 ) -> dfx.Solution:
     """Solve a differential equation on a manifold.
@@ -112,7 +111,7 @@ def diffeqsolve(
     """
     check_arguments(terms, solver, dt0, saveat, stepsize_controller, adjoint, event, consistent)
     check_max_steps(max_steps)
-    check_resets(resets, max_resets)
+    check_resets(resets, max_resets, controller_state)
     warn_of_rounding(y0, time_dtype(t0, t1, dt0, saveat), stepsize_controller)
     constraint = getattr(solver, "constraint", None)
     if isinstance(solver, AbstractManifoldSolver):
@@ -120,7 +119,9 @@ def diffeqsolve(
     solver = without_idle_hook(solver, t0, y0, args)
     if throw and isinstance(stepsize_controller, dfx.ConstantStepSize) and dt0 is not None:
         y0 = raise_if_unstable(y0, terms, solver, dt0)
-    solver = _as_in_steps(solver, stepsize_controller, bool(resets) or event is not None, consistent, y0)
+    solver = _as_in_steps(
+        solver, stepsize_controller, bool(resets) or event is not None, consistent, y0
+    )
     setup = Setup(terms, solver, dt0, saveat, stepsize_controller, consistent, throw, event)
     ready = prepare(setup, ProblemData(t0, t1, y0, args))
     t0, t1, y0, _ = ready.data

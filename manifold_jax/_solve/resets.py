@@ -52,7 +52,11 @@ class SolutionWithResets(dfx.Solution):
 
 
 def with_resets(
-    run: LoopArguments, resets: Sequence[Reset | ResetAt], max_resets: int, setup: Setup, ready: Ready
+    run: LoopArguments,
+    resets: Sequence[Reset | ResetAt],
+    max_resets: int,
+    setup: Setup,
+    ready: Ready,
 ) -> LoopArguments:
     """Return what Diffrax is given for a solve with resets."""
     t0, t1, _, args = ready.data

@@ -7,8 +7,8 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 
-from ..._solver.step.hook_state import with_memory
 from ..._base.types import BoolScalar, FloatScalar
+from ..._solver.step.hook_state import with_memory
 from .functions import begin, save, smooth_part, step_state
 from .parts import in_steps, Inputs, Parts
 from .rows import like, smooth_rows

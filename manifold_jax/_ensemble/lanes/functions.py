@@ -9,9 +9,9 @@ from typing import Any
 import equinox as eqx
 
 from ..._adjoint.replay import Solve, State
-from ..._solver.step.hook_state import memory_of
 from ..._base.compat import directed
 from ..._base.types import FloatScalar
+from ..._solver.step.hook_state import memory_of
 from .trajectory import LaneEquations, Trajectory, TrajectoryData
 
 

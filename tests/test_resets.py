@@ -1,0 +1,604 @@
+"""Jumps of the state at events and at known times, with the derivative of the time of the event."""
+
+import diffrax as dfx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+import pytest
+
+import manifold_jax as mj
+
+
+PID = dfx.PIDController(rtol=1e-9, atol=1e-9)
+FALL = dfx.ODETerm(lambda t, y, args: jnp.stack([y[1], -args[0]]))
+# g, e, z0, v0
+BALL = jnp.array([10.0, 0.8, 5.0, -0.1])
+
+
+def bounced(t, y, args):
+    return jnp.stack([y[0], -args[1] * y[1]])
+
+
+BOUNCE = mj.Reset(lambda t, y, args: y[0], bounced, direction=False)
+
+
+def drop(p, t1=8.0, solver=None, resets=(BOUNCE,), **options):
+    options = dict(stepsize_controller=PID, max_resets=20) | options
+    solver = dfx.Tsit5() if solver is None else solver
+    return mj.diffeqsolve(FALL, solver, 0.0, t1, 0.1, p[2:], p[:2], resets=resets, **options)
+
+
+def bounce_times(p, count):
+    """In closed form."""
+    g, e, z0, v0 = p
+    v = jnp.sqrt(v0**2 + 2 * g * z0)
+    flights = 2 * v / g * jnp.cumprod(jnp.full(count - 1, e))
+    return (v0 + v) / g + jnp.concatenate([jnp.zeros(1), jnp.cumsum(flights)])
+
+
+def height(p, t, count):
+    """After `count` bounces."""
+    g, e, z0, v0 = p
+    since = t - bounce_times(p, count)[-1]
+    return jnp.sqrt(v0**2 + 2 * g * z0) * e**count * since - g * since**2 / 2
+
+
+def test_ten_bounces():
+    """Times, states, first and second derivatives are those of the closed form, in both modes."""
+    sol = drop(BALL)
+    assert int(sol.resets.number) == 10
+    np.testing.assert_allclose(sol.resets.times[:10], bounce_times(BALL, 10), rtol=1e-13)
+    np.testing.assert_allclose(sol.resets.before[:10, 0], 0, atol=1e-13)
+    np.testing.assert_array_equal(sol.resets.after[:10, 1], -0.8 * sol.resets.before[:10, 1])
+    assert np.isinf(sol.resets.times[10:]).all()
+    assert (sol.resets.indices == jnp.where(jnp.arange(20) < 10, 0, -1)).all()
+    assert sol.stats["num_nondifferentiable_resets"] == 0
+    np.testing.assert_allclose(sol.ys[0, 0], height(BALL, 8.0, 10), atol=1e-11)
+
+    end = lambda p: drop(p).ys[0, 0]
+    exact = jax.grad(height)(BALL, 8.0, 10)
+    np.testing.assert_allclose(jax.jit(jax.grad(end))(BALL), exact, rtol=1e-9)
+    np.testing.assert_allclose(jax.jit(jax.jacfwd(end))(BALL), exact, rtol=1e-9)
+    hessian = jax.jit(jax.jacfwd(jax.grad(end)))(BALL)
+    np.testing.assert_allclose(hessian, jax.hessian(height)(BALL, 8.0, 10), rtol=1e-7, atol=1e-7)
+
+
+def test_steps_for_a_bounce():
+    """At most two more per event, which end at it."""
+    events, steps = [], []
+    for t1 in (0.9, 8.0):
+        sol = drop(BALL, t1)
+        events.append(int(sol.resets.number))
+        steps.append(int(sol.stats["num_steps"]))
+    assert events == [0, 10]
+    assert steps[1] <= steps[0] + 3 * events[1]
+
+
+def test_gradients_of_what_is_reported():
+    """Of the times of events and the states on both sides, of values saved between events, of all steps,
+    and of the dense solution, which is two-sided."""
+    ts = jnp.linspace(0.0, 3.0, 7)
+
+    def values(p):
+        saveat = dfx.SaveAt(ts=ts, dense=True)
+        sol = drop(p, 3.0, saveat=saveat, max_steps=64)
+        dense = jax.vmap(sol.evaluate)(jnp.array([0.5, 2.0, 2.9]))
+        resets = sol.resets
+        return resets.times[:2], resets.before[:2], resets.after[:2], sol.ys, dense
+
+    forward = jax.jit(jax.jacfwd(values))(BALL)
+    reverse = jax.jit(jax.jacrev(values))(BALL)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-11), forward, reverse)
+    exact = jax.jacfwd(bounce_times)(BALL, 2)
+    np.testing.assert_allclose(reverse[0], exact, atol=1e-11)
+    np.testing.assert_allclose(reverse[3][-1, 0], jax.grad(height)(BALL, 3.0, 2), atol=1e-11)
+    np.testing.assert_allclose(reverse[4][1, 0], jax.grad(height)(BALL, 2.0, 1), atol=1e-11)
+    t = bounce_times(BALL, 1)[0]
+    sol = drop(BALL, 3.0, saveat=dfx.SaveAt(dense=True), max_steps=64)
+    time = sol.resets.times[0]
+    np.testing.assert_allclose(time, t, rtol=1e-14)
+    before, after = sol.evaluate(time), sol.evaluate(time, left=False)
+    np.testing.assert_allclose(after[1], -0.8 * before[1], rtol=1e-12)
+    np.testing.assert_allclose(jnp.stack([before[0], after[0]]), 0, atol=1e-12)
+
+
+def test_gradient_of_saved_steps():
+    def saved(p):
+        sol = drop(p, 3.0, saveat=dfx.SaveAt(steps=True), max_steps=32)
+        used = jnp.isfinite(sol.ts)
+        return jnp.sum(jnp.where(used, sol.ts, 0)), jnp.sum(jnp.where(used[:, None], sol.ys, 0))
+
+    forward, reverse = jax.jit(jax.jacfwd(saved))(BALL), jax.jit(jax.jacrev(saved))(BALL)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-11), forward, reverse)
+    assert float(jnp.abs(reverse[0]).max()) > 0.1  # by the times of the events
+
+
+SPRING = dfx.ODETerm(lambda t, y, args: jnp.stack([y[1], -(args[0] ** 2) * y[0]]))
+WALL = mj.Reset(lambda t, y, args: y[0] - args[1], lambda t, y, args: jnp.stack([y[0], -y[1]]))
+
+
+def vibrate(p, dt0, solver=None):
+    """An oscillator that starts at 1 and bounces off a wall at `p[1]`."""
+    y0 = jnp.array([1.0, 0.0])
+    solver = dfx.Tsit5() if solver is None else solver
+    return mj.diffeqsolve(SPRING, solver, 0.0, 4.0, dt0, y0, p, resets=(WALL,)).ys[0]
+
+
+def vibration(p):
+    """After three bounces: the phase jumps by twice the angle that is left out."""
+    left_out = 2 * (jnp.pi - jnp.arccos(p[1]))
+    phase = p[0] * 4.0 + 3 * left_out
+    return jnp.stack([jnp.cos(phase), -p[0] * jnp.sin(phase)])
+
+
+@pytest.mark.parametrize(("solver", "order"), [(dfx.Tsit5(), 5), (dfx.Bosh3(), 3), (dfx.Heun(), 2)])
+def test_order_of_convergence(solver, order):
+    """Of the state and of its gradient, with constant steps; Heun's interpolation is a straight line."""
+    p, errors = jnp.array([3.0, -0.3]), []
+    solve = jax.jit(lambda p, dt: (vibrate(p, dt, solver), jax.jacfwd(vibrate)(p, dt, solver)))
+    for n in (160, 320) if order > 2 else (640, 1280):
+        y, jacobian = solve(p, jnp.array(4.0 / n))
+        jacobian = jacobian - jax.jacfwd(vibration)(p)
+        errors.append([jnp.abs(y - vibration(p)).max(), jnp.abs(jacobian).max()])
+    orders = np.log2(np.array(errors[0]) / np.array(errors[1]))
+    np.testing.assert_allclose(orders, order, atol=0.35)
+
+
+def pendulum_field(t, y, args):
+    q, v = y[:2], y[2:]
+    tension = (v @ v - args[0] * q[1]) / (q @ q)
+    return jnp.concatenate([v, -tension * q - args[0] * jnp.array([0.0, 1.0])])
+
+
+CIRCLE = mj.Constraint(
+    lambda t, y, args: jnp.stack([y[:2] @ y[:2] - 1.0, y[:2] @ y[2:]]),
+)
+HIT = mj.Reset(
+    lambda t, y, args: y[0] - args[2],
+    # Not tangent to the circle: the correction makes it so.
+    lambda t, y, args: jnp.stack([y[0] + 1e-3, y[1], -args[1] * y[2], -args[1] * y[3]]),
+    direction=True,
+)
+
+
+def swing(p, solver, t1=3.0, **options):
+    """A pendulum in Cartesian coordinates that hits a wall."""
+    y0 = jnp.array([np.sin(-1.0), -np.cos(1.0), 0.0, 0.0])
+    options = dict(stepsize_controller=PID, resets=(HIT,), max_resets=8) | options
+    return mj.diffeqsolve(dfx.ODETerm(pendulum_field), solver, 0.0, t1, 0.01, y0, p, **options)
+
+
+P = jnp.array([9.81, 0.7, 0.2])
+STABILIZED = mj.Stabilized(dfx.Tsit5(), CIRCLE, stabilization=mj.InvariantStabilization(5.0))
+SOLVERS = {
+    "projected": mj.Projected(dfx.Tsit5(), CIRCLE),
+    "local": mj.LocalCoordinates(dfx.Tsit5(), CIRCLE),
+    "stabilized": STABILIZED,
+    "Dopri8": mj.Projected(dfx.Dopri8(), CIRCLE),
+    "Kvaerno5": mj.Projected(dfx.Kvaerno5(), CIRCLE),
+    "Rodas5P": mj.Projected(mj.Rodas5P(), CIRCLE),
+}
+QUICK = ("projected",)
+
+
+@pytest.mark.parametrize(
+    "name", [n if n in QUICK else pytest.param(n, marks=pytest.mark.slow) for n in SOLVERS]
+)
+def test_on_the_manifold_before_and_after(name):
+    """To round-off, with equal gradients in both modes, which are those of differences."""
+    solver = SOLVERS[name]
+    weights = jnp.array([1.0, 2.0, 0.3, 0.4])
+    end = lambda p: (swing(p, solver).ys[0] @ weights, swing(p, solver).resets)
+    value, resets = jax.jit(end)(P)
+    count = int(resets.number)
+    assert count == 2
+    violation = jax.vmap(lambda y: jnp.max(jnp.abs(CIRCLE(0.0, y, P))))
+    assert violation(resets.after[:count]).max() < 1e-15
+    assert violation(resets.before[:count]).max() < (1e-7 if name == "stabilized" else 1e-15)
+    np.testing.assert_allclose(resets.before[:count, 0], 0.2, atol=1e-14)
+    function = lambda p: end(p)[0]
+    reverse, forward = jax.jit(jax.grad(function))(P), jax.jit(jax.jacfwd(function))(P)
+    np.testing.assert_allclose(reverse, forward, rtol=1e-12)
+    h, quotients = 1e-4, []
+    for i in range(3):
+        at = [jax.jit(function)(P.at[i].add(k * h)) for k in (-2, -1, 1, 2)]
+        quotients.append((at[0] - 8 * at[1] + 8 * at[2] - at[3]) / (12 * h))
+    np.testing.assert_allclose(reverse, quotients, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "adjoint", [dfx.ForwardMode(), pytest.param(dfx.DirectAdjoint(), marks=pytest.mark.slow)]
+)
+def test_adjoints_of_diffrax(adjoint):
+    derivative = jax.jacfwd if isinstance(adjoint, dfx.ForwardMode) else jax.jacrev
+    end = lambda p, **options: drop(p, 2.5, max_steps=40, **options).ys[0]
+    other = jax.jit(derivative(lambda p: end(p, adjoint=adjoint)))(BALL)
+    np.testing.assert_allclose(other, jax.jit(jax.jacrev(end))(BALL), atol=1e-12)
+
+
+def test_batch():
+    """Trajectories with different numbers of events are those solved alone; one that fails is told."""
+    many = jnp.stack([BALL, BALL.at[2].set(1.0), BALL.at[3].set(3.0), BALL.at[1].set(0.3)])
+    solve = lambda p: drop(p, 3.0, throw=False)
+    together = jax.jit(jax.vmap(lambda p: (solve(p).ys[0], solve(p).resets)))(many)
+    result = jax.jit(jax.vmap(lambda p: solve(p).result == dfx.RESULTS.successful))(many)
+    assert result.tolist() == [True, True, True, False]
+    alone = jax.jit(lambda p: (solve(p).ys[0], solve(p).resets))
+    for i in range(4):
+        one = alone(many[i])
+        jax.tree.map(
+            lambda a, b: np.testing.assert_allclose(a[i], b, rtol=1e-12, atol=1e-14), together, one
+        )
+    assert together[1].number.tolist() == [2, 6, 1, 20]
+
+
+def test_three_roots_in_one_step():
+    """SciPy's issue 9228: a cubic with roots at 1, 2 and 3, and steps longer than that. All are found,
+    and the derivative of each is that by itself."""
+
+    def cubic(roots):
+        a, b, c = roots
+        field = lambda t, y, args: jnp.stack(
+            [3 * t**2 - 2 * (a + b + c) * t + a * b + a * c + b * c, 0 * t]
+        )
+        reset = mj.Reset(lambda t, y, args: y[0], lambda t, y, args: jnp.stack([y[0], y[1] + 1.0]))
+        y0 = jnp.stack([-a * b * c, jnp.zeros_like(a)])
+        sol = mj.diffeqsolve(dfx.ODETerm(field), dfx.Tsit5(), 0.0, 10.0, 10.0, y0, resets=(reset,))
+        return sol.resets.times[:3], (sol.resets.number, sol.ys[0, 1])
+
+    roots = jnp.array([1.0, 2.0, 3.0])
+    times, (number, count) = cubic(roots)
+    assert number == 3
+    assert count == 3
+    np.testing.assert_allclose(times, roots, rtol=1e-14)
+    np.testing.assert_allclose(jax.jacrev(cubic, has_aux=True)(roots)[0], np.eye(3), atol=1e-13)
+
+
+def doses(p, times, **options):
+    """Absorption and elimination, with doses at known times."""
+    field = lambda t, y, args: jnp.stack([-args[0] * y[0], args[0] * y[0] - args[1] * y[1]])
+    dose = mj.ResetAt(times, lambda t, y, args: jnp.stack([y[0] + args[2], y[1]]))
+    return mj.diffeqsolve(
+        dfx.ODETerm(field),
+        dfx.Tsit5(),
+        0.0,
+        24.0,
+        None,
+        jnp.zeros(2),
+        p,
+        resets=(dose,),
+        stepsize_controller=PID,
+        **options,
+    )
+
+
+def concentrations(p, times, t):
+    since = jnp.maximum(t - times, 0)
+    depot = p[2] * jnp.exp(-p[0] * since)
+    blood = p[2] * p[0] / (p[1] - p[0]) * (jnp.exp(-p[0] * since) - jnp.exp(-p[1] * since))
+    return jnp.stack([jnp.sum(jnp.where(t >= times, x, 0)) for x in (depot, blood)])
+
+
+def test_known_times():
+    """The first at the start, one after the end; a value saved at such a time is that after the jump, one
+    unit of rounding before it is that before."""
+    p, times = jnp.array([1.1, 0.3, 5.0]), jnp.array([18.0, 0.0, 6.0, 12.0, 24.0, 30.0, -1.0])
+    ts = jnp.array([0.0, np.nextafter(6.0, 0), 6.0, np.nextafter(6.0, 7), 18.0, 24.0])
+    sol = doses(p, times, saveat=dfx.SaveAt(ts=ts))
+    assert sol.resets.times[:5].tolist() == [0.0, 6.0, 12.0, 18.0, np.inf]
+    inside = times.at[jnp.array([4, 6])].set(40.0)  # those at the end and before the start are not made
+    exact = jax.vmap(lambda t: concentrations(p, inside, t))(ts)
+    np.testing.assert_allclose(sol.ys, exact, atol=3e-9)
+    np.testing.assert_allclose(sol.ys[2] - sol.ys[1], [5.0, 0.0], atol=1e-12)
+    end = lambda p, times: doses(p, times).ys[0, 1]
+    exact = jax.grad(lambda p, times: concentrations(p, times, 24.0)[1], (0, 1))(p, inside)
+    for derivative in (jax.grad, jax.jacfwd):
+        of_p, of_times = jax.jit(derivative(end, (0, 1)))(p, times)
+        np.testing.assert_allclose(of_p, exact[0], rtol=1e-7)
+        np.testing.assert_allclose(of_times, exact[1], atol=1e-8)
+
+
+def cradle(masses, t1, restitution=1.0):
+    """Balls on threads in a row, in contact where they hang; the first is let go."""
+    n = masses.size
+    field = lambda t, y, args: jnp.concatenate([y[n:], -9.81 * y[:n]])
+
+    def collide(i):
+        def jump(t, y, args):
+            v, w, a, b = y[n + i], y[n + i + 1], args[i], args[i + 1]
+            impulse = (1 + restitution) * a * b / (a + b) * (v - w)
+            return y.at[n + i].add(-impulse / a).at[n + i + 1].add(impulse / b)
+
+        return mj.Reset(lambda t, y, args: y[i + 1] - y[i], jump, direction=False)
+
+    return mj.diffeqsolve(
+        dfx.ODETerm(field),
+        dfx.Tsit5(),
+        0.0,
+        t1,
+        None,
+        jnp.zeros(2 * n).at[0].set(-0.3),
+        masses,
+        resets=tuple(collide(i) for i in range(n - 1)),
+        stepsize_controller=PID,
+    )
+
+
+def test_newtons_cradle():
+    """Collisions at one time happen one after the other, from ball to ball."""
+    sol = cradle(jnp.ones(4), 0.9)
+    assert sol.resets.indices[:4].tolist() == [0, 1, 2, -1]
+    times = sol.resets.times[:3]
+    np.testing.assert_allclose(times, np.pi / 2 / np.sqrt(9.81), rtol=1e-9)
+    assert times[0] == times[1] == times[2]
+    speed = 0.3 * np.sqrt(9.81)
+    np.testing.assert_allclose(sol.resets.after[2, 4:], [0, 0, 0, speed], atol=1e-9)
+    assert sol.stats["num_nondifferentiable_resets"] == 2
+
+
+def test_a_chain_of_collisions_that_comes_back():
+    """With unequal masses the second ball is thrown back onto the first, at the same time; nothing
+    penetrates, momentum and energy are kept."""
+    masses = jnp.array([1.0, 2.0, 1.0, 3.0])
+    sol = cradle(masses, 0.9)
+    count = int(sol.resets.number)
+    indices = sol.resets.indices[:count].tolist()
+    assert indices[:4] == [0, 1, 2, 1]
+    before, after = sol.resets.before[:count, 4:], sol.resets.after[:count, 4:]
+    np.testing.assert_allclose(before @ masses, after @ masses, atol=1e-12)
+    np.testing.assert_allclose(before**2 @ masses, after**2 @ masses, atol=1e-12)
+    assert jnp.diff(sol.ys[0, :4]).min() > -1e-12
+    final = after[-1]
+    assert (jnp.diff(final) > -1e-9).all()
+
+
+def test_order_of_events_at_one_time():
+    """The first in `resets` comes first, whatever the direction; both happen."""
+    field = dfx.ODETerm(lambda t, y, args: jnp.array([1.0, 1.0, 0.0]))
+    log = lambda k: lambda t, y, args: y.at[2].set(10 * y[2] + k)
+    one = mj.Reset(lambda t, y, args: y[0] - 0.5, log(1.0))
+    two = mj.Reset(lambda t, y, args: 0.5 - y[1], log(2.0))
+    solve = lambda resets: mj.diffeqsolve(
+        field, dfx.Tsit5(), 0.0, 1.0, 0.3, jnp.zeros(3), resets=resets
+    )
+    assert solve((one, two)).ys[0, 2] == 12
+    assert solve((two, one)).ys[0, 2] == 21
+    assert solve((one, two)).stats["num_nondifferentiable_resets"] == 2
+    # A condition that is changed by a jump, without the state passing through zero.
+    pushed = mj.Reset(
+        lambda t, y, args: y[2] - 0.5, lambda t, y, args: y.at[2].set(7.0), direction=True
+    )
+    sol = solve((one, pushed))
+    assert sol.ys[0, 2] == 7
+    assert sol.resets.indices[:2].tolist() == [0, 1]
+    assert sol.resets.times[0] == sol.resets.times[1]
+
+
+def test_an_event_at_the_start():
+    """On the surface and moving across it: at once. On its other side: not at all."""
+    falling = BALL.at[2].set(0.0).at[3].set(-1.0)
+    sol = drop(falling, 0.1)
+    np.testing.assert_allclose(sol.resets.times[:2], [0.0, np.inf])
+    np.testing.assert_allclose(sol.ys[0], [0.8 * 0.1 - 5 * 0.01, 0.8 - 1.0], atol=1e-12)
+    rising = drop(falling.at[3].set(1.0), 0.1)
+    assert rising.resets.number == 0
+    below = drop(falling.at[2].set(-1.0), 0.1)
+    assert below.resets.number == 0
+
+
+def test_backwards_in_time():
+    there = drop(BALL, 3.0).ys[0]
+    back = mj.Reset(lambda t, y, args: y[0], lambda t, y, args: jnp.stack([y[0], -y[1] / args[1]]))
+    sol = mj.diffeqsolve(
+        FALL,
+        dfx.Tsit5(),
+        3.0,
+        0.0,
+        -0.1,
+        there,
+        BALL[:2],
+        resets=(back,),
+        stepsize_controller=PID,
+    )
+    np.testing.assert_allclose(sol.ys[0], BALL[2:], atol=1e-11)
+    np.testing.assert_allclose(sol.resets.times[:2], bounce_times(BALL, 2)[::-1], rtol=1e-13)
+
+
+def test_zeno():
+    """Bounces without end become a result code, and so does a ball that lies on the floor."""
+    for p in (BALL, BALL.at[2:].set(0.0)):
+        sol = drop(p, 12.0, throw=False)
+        assert sol.result == dfx.RESULTS.max_steps_reached
+        assert sol.resets.number == 20
+    with pytest.raises(Exception, match="more events than `max_resets`"):
+        drop(BALL, 12.0)
+
+
+def test_grazing_is_told():
+    """At a zero that is only just reached the time of the event has no derivative."""
+    field = dfx.ODETerm(lambda t, y, args: jnp.stack([2 * (t - 1.0), jnp.ones_like(t)]))
+    touch = mj.Reset(lambda t, y, args: y[0] - args, lambda t, y, args: y)
+    solve = lambda level: mj.diffeqsolve(
+        field, dfx.Tsit5(), 0.0, 2.0, 0.25, jnp.array([1.0, 0.0]), level, resets=(touch,)
+    )
+    assert solve(1e-10).stats["num_nondifferentiable_resets"] >= 1
+    assert solve(0.5).stats["num_nondifferentiable_resets"] == 0
+    assert solve(-0.1).resets.number == 0
+
+
+def test_boolean_conditions():
+    """Met to rounding; their time has no derivative unless it is a function of time alone."""
+    below = mj.Reset(lambda t, y, args: y[0] < 0, bounced)
+    solve = lambda p: drop(p, 3.0, resets=(below,))
+    np.testing.assert_allclose(solve(BALL).ys, drop(BALL, 3.0).ys, atol=1e-10)
+    with pytest.raises(Exception, match="has no derivative"):
+        jax.grad(lambda p: solve(p).ys[0, 0])(BALL)
+    with pytest.raises(Exception, match="true at `t0`"):
+        solve(BALL.at[2].set(-1.0))
+    late = mj.Reset(lambda t, y, args: t > 0.5, lambda t, y, args: y + 1.0)
+    end = lambda p: drop(p, 0.7, resets=(late,)).ys[0, 0]
+    np.testing.assert_allclose(jax.grad(end)(BALL), [-0.245, 0, 1, 0.7], atol=1e-9)
+
+
+def test_an_event_ends_a_solve_with_resets():
+    """Between two bounces, with its derivative through the bounce before it; and at a bounce, if the
+    jump changes its sign."""
+
+    def stop(p, direction):
+        event = dfx.Event(
+            lambda t, y, args, **kwargs: y[1] - 2.0, optx.Newton(1e-12, 1e-12), direction
+        )
+        sol = drop(p, event=event)
+        return sol.ts[0], (sol.ys[0], sol.result)
+
+    exact = lambda p: (
+        bounce_times(p, 1)[0] + (p[1] * jnp.sqrt(p[3] ** 2 + 2 * p[0] * p[2]) - 2) / p[0]
+    )
+    time, (y, result) = stop(BALL, False)
+    assert result == dfx.RESULTS.event_occurred
+    np.testing.assert_allclose(time, exact(BALL), rtol=1e-12)
+    np.testing.assert_allclose(y[1], 2.0, rtol=1e-12)
+    for derivative in (jax.jacfwd, jax.jacrev):
+        of_time, _ = jax.jit(derivative(lambda p: stop(p, False), has_aux=True))(BALL)
+        np.testing.assert_allclose(of_time, jax.grad(exact)(BALL), rtol=1e-9)
+    time, (y, result) = stop(BALL, True)
+    assert result == dfx.RESULTS.event_occurred
+    np.testing.assert_allclose(time, bounce_times(BALL, 1)[0], rtol=1e-13)
+    np.testing.assert_allclose(y, [0.0, 0.8 * np.sqrt(100.01)], atol=1e-9)
+
+
+def test_algebraic_states_follow_from_the_state_after_a_jump():
+    """An index-1 system `x' = -z, 0 = z - k x`: the jump names `x`, and `z` is solved for again."""
+    term = mj.MassMatrixTerm(
+        lambda t, y, k: jnp.stack([-y[1], y[1] - k * y[0]]), jnp.array([1.0, 0.0])
+    )
+    refill = mj.Reset(
+        lambda t, y, k: y[0] - 0.5, lambda t, y, k: jnp.stack([y[0] + 1.0, y[1]]), direction=False
+    )
+
+    def solve(k):
+        y0 = jnp.stack([jnp.ones_like(k), k])
+        sol = mj.diffeqsolve(
+            term, mj.Rodas5P(), 0.0, 1.0, None, y0, k, resets=(refill,), stepsize_controller=PID
+        )
+        return sol.ys[0], sol.resets
+
+    def exact(k):  # from 1 to 0.5, then from 1.5
+        x = 1.5 * jnp.exp(-k * (1.0 - jnp.log(2.0) / k))
+        return jnp.stack([x, k * x])
+
+    k = jnp.array(1.3)
+    y, resets = solve(k)
+    np.testing.assert_allclose(resets.after[0], [1.5, 1.5 * 1.3], rtol=1e-9)
+    np.testing.assert_allclose(y, exact(k), rtol=1e-8)
+    end = lambda k: solve(k)[0]
+    for derivative in (jax.jacfwd, jax.jacrev):
+        np.testing.assert_allclose(jax.jit(derivative(end))(k), jax.jacfwd(exact)(k), rtol=1e-6)
+
+
+def test_a_limited_number_and_clipped_steps():
+    """A reset that can happen twice, beside step size controllers that clip steps."""
+    twice = mj.Reset(lambda t, y, args: y[0], bounced, direction=False, max_number=2)
+    controller = dfx.ClipStepSizeController(PID, step_ts=[1.5], jump_ts=[2.0])
+    sol = drop(
+        BALL,
+        4.5,
+        resets=(twice,),
+        stepsize_controller=controller,
+        saveat=dfx.SaveAt(steps=True, t1=True),
+        max_steps=200,
+    )
+    assert sol.resets.number == 2
+    assert (sol.ts == 1.5).any()
+    since = 4.5 - bounce_times(BALL, 2)[1]
+    falls = 0.64 * np.sqrt(100.01) * since - 5 * since**2
+    end = sol.ys[int(sol.stats["num_accepted_steps"]) - 1]
+    np.testing.assert_allclose(end[0], falls, atol=1e-9)
+    assert falls < 0  # through the floor
+
+
+def test_single_precision():
+    with jax.enable_x64(False):
+        p = jnp.array(BALL, jnp.float32)
+        sol = drop(p, 3.0, stepsize_controller=dfx.PIDController(rtol=1e-4, atol=1e-4))
+        assert sol.ys.dtype == sol.resets.times.dtype == jnp.float32
+        assert sol.resets.number == 2
+        np.testing.assert_allclose(sol.resets.times[:2], bounce_times(p, 2), rtol=1e-5)
+        gradient = jax.grad(lambda p: drop(p, 3.0, stepsize_controller=PID32).ys[0, 0])(p)
+    np.testing.assert_allclose(gradient, jax.grad(height)(BALL, 3.0, 2), rtol=1e-3)
+
+
+PID32 = dfx.PIDController(rtol=1e-4, atol=1e-4)
+
+
+def solve_decay(resets, **options):
+    term = dfx.ODETerm(lambda t, y, args: -y)
+    y0 = jnp.ones(2)
+    return mj.diffeqsolve(term, dfx.Tsit5(), 0.0, 1.0, 0.1, y0, resets=resets, **options)
+
+
+CONDITION = lambda t, y, args: y[0] - 0.5
+
+
+@pytest.mark.parametrize(
+    ("resets", "error", "message"),
+    [
+        (lambda: mj.Reset(CONDITION, 1.0), TypeError, "`jump` must be a callable"),
+        (lambda: mj.Reset(1.0, lambda t, y, args: y), TypeError, "`condition` must be a callable"),
+        (lambda: mj.Reset(CONDITION, lambda y: y), TypeError, "`jump` must be a callable"),
+        (lambda: mj.Reset(CONDITION, bounced, direction=2), ValueError, "`direction` must be"),
+        (lambda: mj.Reset(CONDITION, bounced, samples=0), ValueError, "`samples` must be"),
+        (lambda: mj.Reset(CONDITION, bounced, max_number=0), ValueError, "`max_number` must be"),
+        (lambda: mj.ResetAt("noon", bounced), TypeError, "`times` must be a vector"),
+        (lambda: mj.ResetAt(jnp.ones((2, 2)), bounced), TypeError, "`times` must be a vector"),
+        (lambda: solve_decay(5), TypeError, "`resets` must be a tuple"),
+        (lambda: solve_decay((bounced,)), TypeError, "one with a function"),
+        (
+            lambda: solve_decay((mj.Reset(CONDITION, bounced),), max_resets=0),
+            ValueError,
+            "`max_resets` must be a positive integer",
+        ),
+        (
+            lambda: solve_decay((mj.Reset(CONDITION, lambda t, y, args: y[0]),)),
+            ValueError,
+            r"`resets\[0\].jump` must return a state like `y0`",
+        ),
+        (
+            lambda: solve_decay((mj.Reset(CONDITION, lambda t, y, args: y.astype(complex)),)),
+            TypeError,
+            "must return a state like `y0`, of dtype float64",
+        ),
+        (
+            lambda: solve_decay((mj.Reset(lambda t, y, args: y, lambda t, y, args: y),)),
+            ValueError,
+            "must return one real number",
+        ),
+        (
+            lambda: solve_decay(
+                (mj.Reset(CONDITION, lambda t, y, args: y),), controller_state=(1.0,)
+            ),
+            ValueError,
+            "`controller_state`",
+        ),
+    ],
+)
+def test_bad_input(resets, error, message, as_a_user_meets_it):
+    with pytest.raises(error, match=message):
+        resets()
+
+
+def test_failures_have_a_code_and_a_message():
+    undefined = mj.Reset(lambda t, y, args: jnp.sqrt(y[0] - 0.5), lambda t, y, args: y)
+    missing = mj.Reset(CONDITION, lambda t, y, args: y * jnp.nan)
+    nowhere = mj.Reset(HIT.condition, lambda t, y, args: 0 * y)
+    codes = dfx.RESULTS.nonfinite_input, dfx.RESULTS.nonlinear_divergence
+    messages = "`event` or `resets`", "`jump` in `resets` returned is not finite"
+    for reset, code, message in zip((undefined, missing), codes, messages, strict=True):
+        assert solve_decay((reset,), throw=False).result == code
+        with pytest.raises(Exception, match=message):
+            solve_decay((reset,))
+    sol = swing(P, SOLVERS["projected"], resets=(nowhere,), throw=False)
+    assert sol.result == dfx.RESULTS.nonlinear_divergence
+    with pytest.raises(Exception, match="could not be moved onto the manifold"):
+        swing(P, SOLVERS["projected"], resets=(nowhere,))
