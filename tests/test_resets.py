@@ -190,7 +190,7 @@ def test_on_the_manifold_before_and_after(name):
     solver = SOLVERS[name]
     weights = jnp.array([1.0, 2.0, 0.3, 0.4])
     end = lambda p: (swing(p, solver).ys[0] @ weights, swing(p, solver).resets)
-    value, resets = jax.jit(end)(P)
+    _, resets = jax.jit(end)(P)
     count = int(resets.number)
     assert count == 2
     violation = jax.vmap(lambda y: jnp.max(jnp.abs(CIRCLE(0.0, y, P))))
@@ -228,7 +228,9 @@ def test_batch():
     for i in range(4):
         one = alone(many[i])
         jax.tree.map(
-            lambda a, b: np.testing.assert_allclose(a[i], b, rtol=1e-12, atol=1e-14), together, one
+            lambda a, b, i=i: np.testing.assert_allclose(a[i], b, rtol=1e-12, atol=1e-14),
+            together,
+            one,
         )
     assert together[1].number.tolist() == [2, 6, 1, 20]
 
@@ -287,7 +289,9 @@ def test_known_times():
     ts = jnp.array([0.0, np.nextafter(6.0, 0), 6.0, np.nextafter(6.0, 7), 18.0, 24.0])
     sol = doses(p, times, saveat=dfx.SaveAt(ts=ts))
     assert sol.resets.times[:5].tolist() == [0.0, 6.0, 12.0, 18.0, np.inf]
-    inside = times.at[jnp.array([4, 6])].set(40.0)  # those at the end and before the start are not made
+    inside = times.at[jnp.array([4, 6])].set(
+        40.0
+    )  # those at the end and before the start are not made
     exact = jax.vmap(lambda t: concentrations(p, inside, t))(ts)
     np.testing.assert_allclose(sol.ys, exact, atol=3e-9)
     np.testing.assert_allclose(sol.ys[2] - sol.ys[1], [5.0, 0.0], atol=1e-12)

@@ -1,5 +1,5 @@
 from .constraint import MechanicalConstraint as MechanicalConstraint
-from .impact import impact as impact
+from .impacts import impact as impact
 from .kinematics import AbstractPositions as AbstractPositions
 from .mass import InvertedBlocks as InvertedBlocks
 from .stabilization import Baumgarte as Baumgarte, VelocityStabilization as VelocityStabilization

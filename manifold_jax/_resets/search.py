@@ -58,7 +58,7 @@ class History(eqx.Module):
         return History(jnp.asarray(True), sides, never, zero, jnp.asarray(False))
 
 
-class Samples(NamedTuple):
+class SampledConditions(NamedTuple):
     """The values of the conditions at fractions of a step: at the ends of equal parts, a little beyond
     the end, and just after the start."""
 
@@ -105,7 +105,7 @@ class EventSearch(NamedTuple):
     def is_known(self) -> Bool[Array, " resets"]:
         return jnp.isfinite(self.known_times)
 
-    def sample(self, step: SearchedStep) -> Samples:
+    def sample(self, step: SearchedStep) -> SampledConditions:
         inside = np.arange(self.parts + 1) / self.parts
         fractions = np.concatenate([inside, [1 + _BEYOND, _JUST_AFTER]])
         where = fractions.astype(step.t0.dtype)
@@ -120,16 +120,20 @@ class EventSearch(NamedTuple):
         size = jnp.max(jnp.abs(values[1:n]), axis=0) if n > 1 else jnp.abs(values[0])
         nothing = 4 * jnp.finfo(values.dtype).eps * size
         end = jnp.where(jnp.abs(values[n]) <= nothing, 0, values[n])
-        return Samples(fractions, jnp.concatenate([values[:n], end[None], values[n + 1 :]]))
+        return SampledConditions(
+            fractions, jnp.concatenate([values[:n], end[None], values[n + 1 :]])
+        )
 
-    def may_find(self, step: SearchedStep, samples: Samples, history: History) -> BoolScalar:
+    def may_find(
+        self, step: SearchedStep, samples: SampledConditions, history: History
+    ) -> BoolScalar:
         """Whether the step needs to be looked at: most steps have no event."""
         signs = jnp.sign(samples.in_order)
         changes = jnp.any(self._crosses(signs[:-1], signs[1:]))
         is_known = jnp.any(self.known_times <= step.t1 + _BEYOND * step.length)
         return changes | is_known | step.is_negative | history.after_reset
 
-    def first(self, step: SearchedStep, samples: Samples, history: History) -> Found:
+    def first(self, step: SearchedStep, samples: SampledConditions, history: History) -> Found:
         """Return the first event of a step."""
         noise = self._noise(step, samples)
         before, start, on_surface = self._start(samples, history, noise)
@@ -157,7 +161,9 @@ class EventSearch(NamedTuple):
         directions = jnp.broadcast_to(self.directions, up.shape)
         return (up & (directions >= 0)) | (down & (directions <= 0))
 
-    def _start(self, samples: Samples, history: History, noise: Array) -> tuple[Array, ...]:
+    def _start(
+        self, samples: SampledConditions, history: History, noise: Array
+    ) -> tuple[Array, ...]:
         """Return the signs just before and just after the start of the step, and which conditions are
         zero there up to rounding; the sign of these is that of their rate of change."""
         largest = jnp.max(jnp.abs(samples.inside), axis=0)
@@ -176,7 +182,7 @@ class EventSearch(NamedTuple):
         unknown = jnp.isnan(history.sides) | ~history.after_reset
         return jnp.where(unknown, 0, before), start, on_surface
 
-    def _noise(self, step: SearchedStep, samples: Samples) -> Float[Array, " resets"]:
+    def _noise(self, step: SearchedStep, samples: SampledConditions) -> Float[Array, " resets"]:
         """Return how much rounding of the state may change the conditions at the end of the step."""
         random = np.random.default_rng(0)
 
@@ -191,7 +197,12 @@ class EventSearch(NamedTuple):
         return jnp.where(self.is_boolean, 0, change)
 
     def _roots(
-        self, step: SearchedStep, samples: Samples, place: Array, found: Array, on_surface: Array
+        self,
+        step: SearchedStep,
+        samples: SampledConditions,
+        place: Array,
+        found: Array,
+        on_surface: Array,
     ) -> Float[Array, " resets"]:
         """Return the times at which conditions change sign between samples `place` and `place + 1`."""
         each = jnp.arange(place.size)
@@ -211,7 +222,12 @@ class EventSearch(NamedTuple):
         return jnp.where(found, step.t0 + roots * step.length, jnp.inf)
 
     def _is_at_end(
-        self, step: SearchedStep, samples: Samples, roots: Array, noise: Array, rounding: Any
+        self,
+        step: SearchedStep,
+        samples: SampledConditions,
+        roots: Array,
+        noise: Array,
+        rounding: Any,
     ) -> Bool[Array, " resets"]:
         """Return which roots are the end of the step, up to rounding."""
         rate = jnp.abs(samples.end - samples.values[-4]) * self.parts  # per step
@@ -221,10 +237,14 @@ class EventSearch(NamedTuple):
         tolerance = jnp.where(self.is_known, 4 * rounding, tolerance)
         return jnp.abs(roots - step.t1) <= tolerance
 
-    def _is_irregular(self, samples: Samples, near: Array, touching: Array) -> Array:
+    def _is_irregular(self, samples: SampledConditions, near: Array, touching: Array) -> Array:
         """Return which events have no derivative: more than one at a time, or zeros with almost no slope."""
-        slope = jnp.abs(samples.in_order[-1] - samples.end) / _BEYOND
-        grazes = slope <= 1e-3 * jnp.max(jnp.abs(samples.inside), axis=0)
+        # That at the end of the parabola through three samples.
+        a, b, end = _BEYOND, 1 / self.parts, samples.end
+        right, left = (samples.values[-2] - end) / a, (end - samples.values[-4]) / b
+        grazes = jnp.abs((right * b + left * a) / (a + b)) <= 1e-3 * jnp.max(
+            jnp.abs(samples.inside), axis=0
+        )
         several = jnp.sum(near & ~self.is_known) > 1
         grazes &= ~self.is_boolean & ~self.is_known
         return jnp.where(near, grazes | several, touching)
@@ -232,7 +252,7 @@ class EventSearch(NamedTuple):
     def _chosen(
         self,
         step: SearchedStep,
-        samples: Samples,
+        samples: SampledConditions,
         history: History,
         roots: Array,
         near: Array,

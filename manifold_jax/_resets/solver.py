@@ -20,7 +20,7 @@ from .._solver.base import AbstractManifoldSolver
 from .._solver.step.hook_state import memory_of, with_memory
 from .conditions import Conditions
 from .jump import Jump, jump_at_end
-from .search import EventSearch, Found, History, Samples, SearchedStep
+from .search import EventSearch, Found, History, SampledConditions, SearchedStep
 
 
 class Met(NamedTuple):
@@ -177,7 +177,7 @@ class Resetting(dfx.AbstractWrappedSolver):
         given = without_derivative(given)
         held = lambda function: without_derivative(convert_closure(function, *given))(*given)
 
-        def sample(*given: Any) -> tuple[Samples, BoolScalar]:
+        def sample(*given: Any) -> tuple[SampledConditions, BoolScalar]:
             search, step, history = self._search(terms, *given)
             samples = search.sample(step)
             return samples, search.may_find(step, samples, history)
@@ -284,7 +284,9 @@ class Resetting(dfx.AbstractWrappedSolver):
         return self.inner.func(terms, t0, y0, args)
 
 
-def _first(search: EventSearch, step: SearchedStep, history: History, samples: Samples) -> Found:
+def _first(
+    search: EventSearch, step: SearchedStep, history: History, samples: SampledConditions
+) -> Found:
     return search.first(step, samples, history)
 
 

@@ -84,6 +84,12 @@ def diffeqsolve(
         the steps that were made. Diffrax's own adjoints compute steps again, which round differently
         and get other sizes: with tight tolerances their gradients are less accurate than the solution.
 
+    - `resets`: jumps of the state at events ([`Reset`][]) or at known times ([`ResetAt`][]), a tuple. The
+        solution then has `sol.resets` ([`Resets`][]). Dense output and saved values are those
+        between the jumps; at a time of a jump the one after it is saved. Events from `t1` on are not met.
+    - `max_resets`: the largest number of jumps, for which room is made. One more ends the solve with
+        `RESULTS.max_steps_reached`.
+
     Python floats in `y0` and `args`, and all numbers in `t0`, `t1` and `dt0`, become arrays: other values do
     not cause another compilation. Integers in `args`, which may be shapes, and tolerances are part of the
     compiled program; pass `jnp.asarray(...)` if they vary.
@@ -98,6 +104,8 @@ def diffeqsolve(
     - `correction_share`: with [`Projected`][] the fraction of the steps that the corrections undid,
         their sum over that of the displacements. For a tangent field it is as small as the tolerance;
         otherwise see [`tangent_field`][].
+    - `num_nondifferentiable_resets`, with `resets`: how many of them have no derivative, because a
+        condition only touches zero, or because there are several at one time.
 
     **Raises:**
 
