@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 
+from .._resets.reset import check_resets
 from .data import check_times, make_records
 from .model import as_function_of_constraint, Simulator
 from .optimize import Options
@@ -48,6 +49,8 @@ def fit(
     stepsize_controller: dfx.AbstractStepSizeController | None = None,
     dt0: Any = None,
     max_steps: int | None = 4096,
+    resets: Any = (),
+    max_resets: int = 100,
     progress: bool = False,
     throw: bool = True,
 ) -> FitResult:
@@ -72,7 +75,7 @@ def fit(
     - `model`: a problem of the gallery (`parameters` is then a dictionary with some of the
         fields of its `args`); an [`MechanicalSystem`][] (`parameters` is then its `args`); or a
         function of the parameters that returns one of these or `(terms, constraint)`, which get
-        the parameters as `args`. Define such a function once: calls with the same one share
+        the parameters as `args`; `terms` alone for an equation without constraints. Define such a function once: calls with the same one share
         compiled code. [`Invariants`][] are frozen anew at the initial state of each solve.
     - `parameters`: the values to start from, any pytree of real numbers and arrays, `p` in all.
     - `ts`: increasing times of the measurements, shape `(times,)`; or `(records, times)` for
@@ -116,6 +119,8 @@ def fit(
     - `solver`: a Diffrax solver, wrapped in [`Projected`][], or a function of the constraint.
     - `stepsize_controller`, `dt0`, `max_steps`: as for [`diffeqsolve`][]. The default tolerance
         is 1e-8 (1e-5 in single precision).
+    - `resets`, `max_resets`: jumps of the state as for [`diffeqsolve`][], in all records; their functions get
+        the `args` that the vector field gets. For one segment.
     - `progress`: whether to report compilation and steps: by a progress bar
         on a terminal, by lines in a file or a notebook.
     - `throw`: whether a fit that did not end well raises; otherwise look at `result.success`.
@@ -150,7 +155,8 @@ def fit(
     if optimizer is None:
         tolerance = _by_precision(1e-7, 1e-3)
         optimizer = optx.LevenbergMarquardt(rtol=tolerance, atol=tolerance)
-    solves = solver, stepsize_controller, dt0, max_steps
+    check_resets(resets, max_resets, None)
+    solves = solver, stepsize_controller, dt0, tuple(resets), max_steps, max_resets
     simulator = Simulator(model, transform, y0, observe, *solves, many=np.ndim(ts) == 2)
     check_initial(simulator, np.shape(ts))
     start = transform.unravel(transform.start)
@@ -161,6 +167,11 @@ def fit(
     meter = FitMeter(progress)
     options = Options(optimizer, steps, patience, batch_size, seed, starts, meter)
     check_options(options, loss, segments, records)
+    if resets and segments != 1:
+        raise ValueError(
+            f"`segments` must be 1 with `resets`, which may happen where a segment begins, got {segments!r}. Give "
+            "`parameters` or several `starts` that are closer."
+        )
     with meter:
         with meter.compiling("the solves"):
             pieces = make_pieces(records, segments, simulator, states, fit_initial)

@@ -14,8 +14,9 @@ from jaxtyping import Array, Float
 from .._base.compat import is_okay
 from .._base.types import Args, BoolScalar, FloatScalar, IntScalar, Y
 from .._constraint.checks import check_state
-from .._constraint.constraint import AbstractConstraint, Invariants
+from .._constraint.constraint import AbstractConstraint, Constraint, Invariants
 from .._mechanics import MechanicalSystem
+from .._resets.reset import Reset, ResetAt
 from .._solve import diffeqsolve
 from .._solver import Projected
 from .._solver.base import AbstractManifoldSolver
@@ -64,7 +65,9 @@ class Simulator(eqx.Module):
     solver: Callable  # maps the constraint, which depends on the parameters, to a solver
     controller: dfx.AbstractStepSizeController
     dt0: Any
+    resets: tuple[Reset | ResetAt, ...]
     max_steps: int | None = eqx.field(static=True)
+    max_resets: int = eqx.field(static=True)
     many: bool = eqx.field(static=True)
 
     def setting(self, parameters: Any, record: Any) -> Setting:
@@ -121,6 +124,8 @@ class Simulator(eqx.Module):
             stepsize_controller=self.controller,
             adjoint=adjoint,
             max_steps=self.max_steps,
+            resets=self.resets,
+            max_resets=self.max_resets,
             throw=False,
         )
         states = jax.vmap(lambda y: jfu.ravel_pytree(y)[0])(sol.ys)
@@ -140,15 +145,24 @@ def at_start(constraint: AbstractConstraint, t: Any, y: Y, args: Args) -> Abstra
     return constraint
 
 
+def _no_equations(t: Any, y: Y, args: Args) -> Array:
+    return jnp.zeros(0)
+
+
+_NO_EQUATIONS = Constraint(_no_equations)  # of an equation on the whole space
+
+
 def _build(model: Any, parameters: Any) -> Any:
-    """Call a gallery problem, a mechanical system or a function that returns `(terms, constraint)`."""
+    """Return a gallery problem or a mechanical system with these parameters, or `(terms, constraint)`."""
     if hasattr(model, "with_args"):
         return model.with_args(_args_of(model, parameters))
     if isinstance(model, MechanicalSystem):
         return model
+    if isinstance(model, dfx.AbstractTerm):
+        return model, _NO_EQUATIONS
     if not callable(model):
         raise TypeError(
-            "`model` must be a problem of the gallery, an `mj.MechanicalSystem`, or a function of "
+            "`model` must be a problem of the gallery, an `mj.MechanicalSystem`, a term of Diffrax, or a function of "
             f"the parameters that returns one or `(terms, constraint)`, got {type(model).__name__}."
         )
     built = model(parameters)
@@ -157,9 +171,11 @@ def _build(model: Any, parameters: Any) -> Any:
         return built
     if isinstance(built, MechanicalSystem) or hasattr(built, "with_args"):
         return built
+    if isinstance(built, dfx.AbstractTerm):
+        return built, _NO_EQUATIONS
     raise TypeError(
-        "`model(parameters)` must return a problem of the gallery, an `mj.MechanicalSystem` or "
-        f"`(terms, constraint)`, got {type(built).__name__}."
+        "`model(parameters)` must return a problem of the gallery, an `mj.MechanicalSystem`, `(terms, constraint)` "
+        f"or a term of Diffrax, got {type(built).__name__}."
     )
 
 

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 
-from .._constraint.checks import check_constraint
+from .._constraint.checks import check_constraint, has_no_equations
 from .._constraint.constraint import Invariants
 from .._constraint.residual import jacobian, residual_vector
 from .data import filled_in_time, flatten, Records
@@ -96,10 +96,13 @@ def _charts(simulator: Simulator, start: np.ndarray, guess: np.ndarray, needed: 
     """
     R, S, n = guess.shape
     setting = simulator.given()
-    check_constraint(setting.constraint, start[0, 0], setting.y0, setting.args)
+    given = setting.constraint, start[0, 0], setting.y0, setting.args
+    is_free = has_no_equations(*given)
+    if not is_free:
+        check_constraint(*given)
     if not needed:
         return np.zeros((R, S, n, 0))
-    if isinstance(setting.constraint, Invariants):
+    if is_free or isinstance(setting.constraint, Invariants):
         return np.broadcast_to(np.eye(n), (R, S, n, n))
     unravel = jfu.ravel_pytree(setting.y0)[1]
 

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 
+from .._constraint.checks import has_no_equations
 from .._constraint.project import consistent_state
 from .data import Records, unflatten
 from .objective import Objective
@@ -58,8 +59,8 @@ def _initial_states(u: Any, objective: Objective) -> Any:
 
     def one(x: Any, piece: Any) -> Any:
         begin = objective.simulator.beginning(x, piece)
-        y0, _ = consistent_state(begin.constraint, piece.start, begin.y0, begin.args, throw=False)
-        return y0
+        given = begin.constraint, piece.start, begin.y0, begin.args
+        return begin.y0 if has_no_equations(*given) else consistent_state(*given, throw=False)[0]
 
     return jax.vmap(one)(x, pieces)
 

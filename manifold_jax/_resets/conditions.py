@@ -31,10 +31,11 @@ class Conditions(eqx.Module):
     @staticmethod
     def of(resets: Sequence[Reset | ResetAt], t: RealScalarLike, y: Y, args: Args) -> "Conditions":
         """Check the functions of the resets; `t` and `y` are examples of a time and a state."""
+        resets = [r.with_times(args) if isinstance(r, ResetAt) else r for r in resets]
         kinds = [_is_boolean(i, reset, t, y, args) for i, reset in enumerate(resets)]
         for i, reset in enumerate(resets):
             _check_jump(i, reset, t, y, args)
-        return Conditions(list(resets), args, tuple(kinds))
+        return Conditions(resets, args, tuple(kinds))
 
     def __len__(self) -> int:
         return len(self.resets)

@@ -76,7 +76,8 @@ class ResetAt(eqx.Module):
 
     **Arguments:**
 
-    - `times`: array of shape `(k,)`, in any order.
+    - `times`: array of shape `(k,)`, in any order; or a function `times(args)` that returns it, for times
+        that each trajectory of an ensemble has of its own.
     - `jump`: `jump(t, y, args) -> y`, the state after the jump, of the same structure, shapes and dtypes.
 
     **Raises:**
@@ -84,21 +85,33 @@ class ResetAt(eqx.Module):
     `TypeError` or `ValueError` for times that are not a vector of numbers, or for another `jump`.
     """
 
-    times: Array
+    times: Array | Callable[[Args], Any]
     jump: Callable[[RealScalarLike, Y, Args], Y]
 
     def __init__(
-        self, times: Sequence[float] | Array, jump: Callable[[RealScalarLike, Y, Args], Y]
+        self,
+        times: Sequence[float] | Array | Callable[[Args], Any],
+        jump: Callable[[RealScalarLike, Y, Args], Y],
     ):
-        try:
-            array = jnp.asarray(times)
-        except (TypeError, ValueError):
-            array = jnp.zeros(0, bool)
-        if array.ndim != 1 or array.dtype == bool or jnp.iscomplexobj(array):
-            raise TypeError(f"`times` must be a vector of numbers, got {_described(times)}.")
         check_function("jump", jump, "jump(t, y, args)")
-        self.times = array if jnp.issubdtype(array.dtype, jnp.floating) else array.astype(float)
+        self.times = times if callable(times) else _vector(times)
         self.jump = jump
+
+    def with_times(self, args: Args) -> "ResetAt":
+        """Return this with the times as an array."""
+        return ResetAt(self.times(args), self.jump) if callable(self.times) else self
+
+
+def _vector(times: Any) -> Array:
+    try:
+        array = jnp.asarray(times)
+    except (TypeError, ValueError):
+        array = jnp.zeros(0, bool)
+    if array.ndim != 1 or array.dtype == bool or jnp.iscomplexobj(array):
+        raise TypeError(
+            f"`times` must be a vector of numbers, or a function of `args` that returns one, got {_described(times)}."
+        )
+    return array if jnp.issubdtype(array.dtype, jnp.floating) else array.astype(float)
 
 
 def check_resets(resets: Any, max_resets: Any, controller_state: Any) -> None:

@@ -25,11 +25,11 @@ _TRUE_AT_START = (
     "is meant to happen at the start, or write a condition that is false there."
 )
 
-_TOO_MANY = (
+TOO_MANY_RESETS = (
     "There were more events than `max_resets`. If they come closer and closer to each other (a bouncing ball at rest), "
     "let a terminating `event` or another condition take over; otherwise increase `max_resets`."
 )
-_NO_STATE_AFTER = (
+NO_STATE_AFTER = (
     "The state that a `jump` in `resets` returned is not finite, or could not be moved onto the manifold: no nearby state "
     "satisfies the equations of `constraint`. Return a state that does."
 )
@@ -102,7 +102,7 @@ def finish_resets(
     stats = {**sol.stats, "num_nondifferentiable_resets": state.history.irregular}
     sol = eqx.tree_at(lambda s: s.stats, sol, stats)
     too_many = controller_state.record.number > resets.times.size
-    faults = [(too_many, _TOO_MANY), (state.history.failed, _NO_STATE_AFTER)]
+    faults = [(too_many, TOO_MANY_RESETS), (state.history.failed, NO_STATE_AFTER)]
     sol = finish(setup, ready, sol, constraint, faults)
     fields = {name: getattr(sol, name) for name in dfx.Solution.__dataclass_fields__}
     if not setup.saveat.solver_state:

@@ -15,6 +15,7 @@ from ..._adjoint import StepReplayAdjoint
 from ..._base.errors import clear_errors, refuse_old_names
 from ..._base.numbers import numbers_as_arrays
 from ..._base.types import Args, RealScalarLike, Y
+from ..._resets.reset import check_resets
 from ..._solve.arguments import check_arguments, fault_of_field, warn_of_rounding, without_idle_hook
 from ..._solve.setup import Consistent
 from ..._solve.times import checking_first_step
@@ -54,6 +55,9 @@ def solve_ensemble(
     saveat: dfx.SaveAt = dfx.SaveAt(t1=True),
     stepsize_controller: dfx.AbstractStepSizeController = dfx.ConstantStepSize(),
     max_steps: int = 4096,
+    event: dfx.Event | None = None,
+    resets: Any = (),
+    max_resets: int = 100,
     args_axes: Any = None,
     lanes: int = DEFAULT_LANES,
     adjoint: dfx.AbstractAdjoint = StepReplayAdjoint(),
@@ -77,6 +81,8 @@ def solve_ensemble(
     - `args`, `args_axes`: a prefix of the tree of `args` with 0 for leaves that have a leading axis of
         trajectories, and `None` for those common to all; by default all are common.
     - `saveat`: the end, `SaveAt(t1=True)`, the start, times (common to all), and functions of them.
+    - `event`, `resets`, `max_resets`: as of [`diffeqsolve`][], for each trajectory on its own. What differs
+        between trajectories, such as `mj.ResetAt(lambda args: args["doses"], jump)`, is in `args`.
     - `lanes`: how many trajectories advance together, on each device.
     - `adjoint`: the mode of differentiation: reverse, or `diffrax.ForwardMode()` for `jax.jvp` and
         `jax.jacfwd`. Both make the steps again that the solve made.
@@ -91,7 +97,7 @@ def solve_ensemble(
 
     Explicit Runge-Kutta methods, in a hook or alone, and [`Rodas5P`][] and [`Rodas3P`][] alone for up
     to eight unknowns, with constant steps or `diffrax.PIDController`, are advanced in lanes. Other solvers,
-    mass matrices, other controllers and systems too large to be written out number by number are
+    mass matrices, other controllers, events, resets and systems too large to be written out number by number are
     solved by `diffeqsolve` under `jax.lax.map` in batches of `lanes`. `execution` of the solution says
     which of the two was used, and why.
 
@@ -107,7 +113,8 @@ def solve_ensemble(
     """
     if mesh is not None:
         check_mesh(mesh, solver)
-    check_arguments(terms, solver, dt0, saveat, stepsize_controller, adjoint, None, consistent)
+    check_arguments(terms, solver, dt0, saveat, stepsize_controller, adjoint, event, consistent)
+    check_resets(resets, max_resets, None)
     batch = checked_batch(t0, t1, dt0, y0s, args, args_axes, saveat, lanes)
     if not isinstance(max_steps, int) or max_steps < 1:
         raise ValueError(f"`max_steps` must be a positive integer, got {max_steps!r}.")
@@ -115,7 +122,18 @@ def solve_ensemble(
     warn_of_rounding(one.y0, batch.dtype, stepsize_controller)
     solver = without_idle_hook(solver, one.t0, one.y0, one.args)
     equations = LaneEquations(
-        terms, solver, stepsize_controller, saveat, dt0, adjoint, max_steps, lanes, consistent
+        terms,
+        solver,
+        stepsize_controller,
+        saveat,
+        dt0,
+        adjoint,
+        max_steps,
+        lanes,
+        consistent,
+        event,
+        resets,
+        max_resets,
     )
 
     def solve(inputs: Inputs, axes: Axes = ()) -> EnsembleSolution:
@@ -130,7 +148,7 @@ def solve_ensemble(
                 raise ValueError(fault) from error
             error.add_note(_example(batch))
             raise
-        solution = dataclasses.replace(solution, messages=messages_of(solver))
+        solution = dataclasses.replace(solution, messages=messages_of(solver, bool(resets)))
         if not throw:
             return solution
         number, failed = largest(solution.reasons(), axes), anywhere(solution.failed, axes)

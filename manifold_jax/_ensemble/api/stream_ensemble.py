@@ -55,6 +55,9 @@ def stream_ensemble(
     saveat: dfx.SaveAt = dfx.SaveAt(t1=True),
     stepsize_controller: dfx.AbstractStepSizeController = dfx.ConstantStepSize(),
     max_steps: int = 4096,
+    event: dfx.Event | None = None,
+    resets: Any = (),
+    max_resets: int = 100,
     lanes: int = DEFAULT_LANES,
     consistent: Consistent = "project",
     chunk: int = 8192,
@@ -91,8 +94,8 @@ def stream_ensemble(
         Leaves of `args` that it does not compute are common to all.
     - `size`: the number of trajectories.
     - `path`: the folder; made if it does not exist, and refused if it is not empty unless `resume`.
-    - `terms`, `solver`, `dt0`, `saveat`, `stepsize_controller`, `max_steps`, `lanes`, `consistent`:
-        as of [`solve_ensemble`][].
+    - `terms`, `solver`, `dt0`, `saveat`, `stepsize_controller`, `max_steps`, `event`, `resets`, `max_resets`, `lanes`,
+        `consistent`: as of [`solve_ensemble`][].
     - `t0`, `t1`: common to all, or functions `(index, key)` like `sample`.
     - `chunk`: how many trajectories are solved and written together. Much larger than `lanes`, as
         lanes run empty at the end of each chunk.
@@ -131,6 +134,10 @@ def stream_ensemble(
         "lanes": lanes,
         "consistent": consistent,
     }
+    if event is not None:
+        given["event"] = event
+    if resets:
+        given |= {"resets": resets, "max_resets": max_resets}
     call = lambda start: (given, key, jnp.asarray(start), size, chunk)
     examples = eqx.filter_eval_shape(_solve_chunk, *call(0))
     named(examples)  # refuses names before anything is written
@@ -140,7 +147,7 @@ def stream_ensemble(
     with clear_write_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
     with only_writer(folder):
-        stored = _opened(folder, described, messages_of(solver), examples, resume)
+        stored = _opened(folder, described, messages_of(solver, bool(resets)), examples, resume)
         _compute(stored, lowered, call, progress)
     return stored
 
@@ -175,7 +182,8 @@ def _solve_chunk(
     options = {name: x for name, x in given.items() if name != "sample"} | samples
     solution = solve_ensemble(**options)
     result = solution.reasons().astype(jnp.int8)
-    return {"ts": solution.ts, "ys": solution.ys, "stats": solution.stats, "result": result}
+    values = {"ts": solution.ts, "ys": solution.ys, "stats": solution.stats, "result": result}
+    return values if solution.resets is None else values | {"resets": vars(solution.resets)}
 
 
 def _opened(

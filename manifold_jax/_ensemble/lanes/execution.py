@@ -57,6 +57,10 @@ def _obstacle(inputs: Inputs) -> str | None:
             return f"more than {LARGEST_STIFF} unknowns of a stiff system"
     elif not is_unrollable(solver.inner, equations.terms, one.t0, one.t1, one.y0, one.args):
         return f"{type(solver.inner).__name__} is not an explicit Runge-Kutta method"
+    if equations.event is not None:
+        return "an `event` is searched for"
+    if equations.resets:
+        return "there are `resets`"
     if type(equations.controller) not in (dfx.PIDController, dfx.ConstantStepSize):
         return f"`stepsize_controller` is {type(equations.controller).__name__}"
     if not isinstance(equations.adjoint, StepReplayAdjoint | dfx.ForwardMode):

@@ -17,7 +17,7 @@ def solve_mapped(inputs: Inputs) -> EnsembleSolution:
     solver = equations.solver
     solver = solver.inner if isinstance(solver, Unconstrained) else solver
 
-    def one(of_each: Any) -> tuple[Any, ...]:
+    def one(of_each: Any) -> EnsembleSolution:
         given = batch.complete(of_each)
         times = given.t0, given.t1, equations.dt0
         sol = diffeqsolve(
@@ -31,13 +31,23 @@ def solve_mapped(inputs: Inputs) -> EnsembleSolution:
             max_steps=equations.max_steps,
             adjoint=equations.adjoint,
             consistent=equations.consistent,
+            event=equations.event,
+            resets=equations.resets,
+            max_resets=equations.max_resets,
             throw=False,
         )
         stats = {name: x for name, x in sol.stats.items() if name != "max_steps"}
-        return sol.ts, sol.ys, stats, sol.result
+        return EnsembleSolution(
+            sol.ts,
+            sol.ys,
+            stats,
+            sol.result,
+            event_mask=sol.event_mask,
+            resets=getattr(sol, "resets", None),
+        )
 
     at_a_time = min(equations.lanes, batch.size)
-    return EnsembleSolution(*jax.lax.map(one, batch.each, batch_size=at_a_time))
+    return jax.lax.map(one, batch.each, batch_size=at_a_time)
 
 
 def _times_and_values(inputs: Inputs) -> Any:

@@ -10,7 +10,9 @@ import numpy as np
 from diffrax import RESULTS
 from jaxtyping import Array, PyTree
 
-from ..._base.compat import is_okay, number_of_result
+from ..._base.compat import is_okay, nonlinear_failure, number_of_result
+from ..._resets.record import Resets
+from ..._solve.resets import NO_STATE_AFTER, TOO_MANY_RESETS
 from ..._solve.outcome import (
     is_unusable_start,
     is_without_time,
@@ -29,6 +31,8 @@ class EnsembleSolution(eqx.Module):
     - `ys`: the saved values, `(N, T, ...)`.
     - `stats`: as of [`diffeqsolve`][] without `max_steps`, each of shape `(N,)`.
     - `result`: the result codes of all trajectories.
+    - `event_mask`: with `event`, which of its functions ended each trajectory; as of `diffrax.Solution`.
+    - `resets`: with `resets`, those of all trajectories, a [`Resets`][] with the trajectories in front.
     - `execution`: "in lanes", or why not.
     - `messages`: those of the result codes, by number; the last three are for a trajectory without
         steps whose times or start could not be used.
@@ -38,6 +42,8 @@ class EnsembleSolution(eqx.Module):
     ys: PyTree[Array]
     stats: dict[str, Any]
     result: RESULTS
+    event_mask: PyTree[Array] | None = None
+    resets: Resets | None = None
     execution: str = eqx.field(static=True, default="in lanes")
     messages: tuple[str, ...] = eqx.field(static=True, default=(), repr=False)
 
@@ -68,6 +74,11 @@ class EnsembleSolution(eqx.Module):
         return sorted(failed.items())[:most]
 
 
-def messages_of(solver: dfx.AbstractSolver) -> tuple[str, ...]:
+def messages_of(solver: dfx.AbstractSolver, has_resets: bool) -> tuple[str, ...]:
     """Return the messages for the numbers of `EnsembleSolution.reasons`."""
-    return (*messages_for(solver), NO_TIME, NOT_FINITE_START, UNUSABLE_START)
+    messages = messages_for(solver)
+    if has_resets:
+        more = (RESULTS.max_steps_reached, TOO_MANY_RESETS), (nonlinear_failure(), NO_STATE_AFTER)
+        for result, text in more:
+            messages[int(number_of_result(result))] += f" Or: {text}"
+    return (*messages, NO_TIME, NOT_FINITE_START, UNUSABLE_START)

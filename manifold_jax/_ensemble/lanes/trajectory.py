@@ -88,6 +88,9 @@ class LaneEquations(eqx.Module):
     max_steps: int = eqx.field(static=True)
     lanes: int = eqx.field(static=True)  # how many trajectories advance together
     consistent: Consistent = eqx.field(static=True)
+    event: dfx.Event | None = None  # not in lanes, as the resets
+    resets: Any = ()
+    max_resets: int = eqx.field(static=True, default=100)
 
     def begin(self, given: TrajectoryData) -> LaneStart:
         solver, args = self.solver, given.args

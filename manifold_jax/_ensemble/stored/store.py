@@ -26,6 +26,7 @@ class StoredEnsemble:
 
     - `group`: the folder as a `zarr.Group`, of the arrays below.
     - `ts`, `ys`, `stats`: as of [`EnsembleSolution`][], `zarr.Array`s or groups of them.
+    - `resets`: those of [`EnsembleSolution`][], if there are any.
     - `result`: result codes, 0 for success, -1 for trajectories that have not been computed yet;
         `messages` has their meaning.
     - `settings`: the settings of the run.
@@ -40,6 +41,7 @@ class StoredEnsemble:
     ts = property(lambda self: self.group["ts"])
     ys = property(lambda self: self.group["ys"])
     stats = property(lambda self: self.group["stats"])
+    resets = property(lambda self: self.group.get("resets"))
     result = property(lambda self: self.group["result"])
 
     @property
