@@ -2,7 +2,8 @@
 
 Every function builds a [`Problem`][]; its docstring has the equations, the source of every number and
 the digits to trust. `ALL` has those that take seconds to compile: not the delta robot and the Stewart
-platform, nor those that are there to be large (`polymer`, `cable_net`, `falling_truss`, `n_four_bar`).
+platform, nor those that are there to be large (`polymer`, `cable_net`, `falling_truss`, `n_four_bar`) or
+that have jumps (`compass_gait`).
 """
 
 from collections.abc import Callable
@@ -11,6 +12,7 @@ from ._problem import Problem as Problem
 from .cable_net import cable_net as cable_net
 from .car_axis import car_axis as car_axis
 from .chain import chain as chain, double_pendulum as double_pendulum
+from .compass_gait import compass_gait as compass_gait
 from .delta_robot import delta_robot as delta_robot
 from .falling_truss import falling_truss as falling_truss
 from .four_bar import four_bar as four_bar

@@ -16,6 +16,7 @@ from jaxtyping import Array
 from .._base.types import Args, ResidualFunction, Y
 from .._constraint.constraint import AbstractConstraint, Invariants
 from .._mechanics import MechanicalSystem
+from .._resets.reset import Reset, ResetAt
 from .._solver.chart import AbstractChart
 
 
@@ -42,6 +43,44 @@ def integrate(
     return states
 
 
+def integrate_with_resets(
+    field: Callable[[float, np.ndarray], Sequence[float] | np.ndarray],
+    x0: Sequence[float] | np.ndarray,
+    t: np.ndarray,
+    condition: Callable[[float, np.ndarray], float],
+    jump: Callable[[float, np.ndarray], np.ndarray],
+) -> np.ndarray:
+    """Solve from time 0 forwards as `integrate` does, restarted with `jump(t, x)` where
+    `condition(t, x)` falls through zero. At these times the states are those after the jump."""
+
+    def falls(t: float, x: np.ndarray) -> float:
+        return condition(t, x)
+
+    falls.terminal, falls.direction = True, -1
+    start, end, x = 0.0, float(np.max(t, initial=0.0)), np.asarray(x0, np.float64)
+    if np.any(t < 0):
+        raise ValueError("The solution with jumps is not known before the start.")
+    states = np.tile(x, (t.size, 1))
+    while start < end:
+        solution = scipy.integrate.solve_ivp(
+            field,
+            (start, end),
+            x,
+            method="DOP853",
+            rtol=3e-14,
+            atol=1e-15,
+            dense_output=True,
+            events=falls,
+        )
+        inside = t >= start
+        states[inside] = solution.sol(np.minimum(t[inside], solution.t[-1])).T
+        start, x = solution.t[-1], solution.y[:, -1]
+        if solution.status == 1:
+            x = jump(start, x)
+            states[t >= start] = x
+    return states
+
+
 class Problem(eqx.Module):
     """An initial value problem on a manifold, with its solution.
 
@@ -64,6 +103,7 @@ class Problem(eqx.Module):
         `None` for the standard one of `args`.
     - `initial_state`: `(args, start) -> y0`, by default `start` itself.
     - `invariants`: `(t, y, args)`, conserved quantities. Frozen at `y0` they are the constraint.
+    - `resets`: the jumps of its state, for [`diffeqsolve`][]; most problems have none.
     - `exact`: `(t, args, y0) -> y` in NumPy, `t` of shape `(times,)`; the leaves of
         `y` get that leading axis. Raises `ValueError` where it does not hold.
     - `reference_at_end_only`: whether `reference` knows the solution at `t1` alone.
@@ -82,6 +122,7 @@ class Problem(eqx.Module):
     start: Y | None = None
     initial_state: Callable[[Any, Any], Y] | None = eqx.field(static=True, default=None)
     invariants: ResidualFunction | None = eqx.field(static=True, default=None)
+    resets: tuple[Reset | ResetAt, ...] = ()
     exact: Callable[[np.ndarray, Any, Any], Any] = eqx.field(static=True)
     reference_at_end_only: bool = eqx.field(static=True, default=False)
 
