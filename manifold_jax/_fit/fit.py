@@ -75,8 +75,8 @@ def fit(
     - `model`: a problem of the gallery (`parameters` is then a dictionary with some of the
         fields of its `args`); an [`MechanicalSystem`][] (`parameters` is then its `args`); or a
         function of the parameters that returns one of these or `(terms, constraint)`, which get
-        the parameters as `args`; `terms` alone for an equation without constraints. Define such a function once: calls with the same one share
-        compiled code. [`Invariants`][] are frozen anew at the initial state of each solve.
+        the parameters as `args`; `terms` alone for an equation without constraints. Define such
+        a function once: calls with the same one share compiled code. [`Invariants`][] are frozen anew at the initial state of each solve.
     - `parameters`: the values to start from, any pytree of real numbers and arrays, `p` in all.
     - `ts`: increasing times of the measurements, shape `(times,)`; or `(records, times)` for
         many trajectories with the same parameters.

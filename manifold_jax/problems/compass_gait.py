@@ -142,7 +142,7 @@ def _after_strike(x: np.ndarray, masses: tuple[float, ...]) -> np.ndarray:
 
     after = lambda u, w: momenta(-length * w * across(b), u, w)
     before = momenta(-length * u * across(a), u, w)
-    other, stance = np.linalg.solve(np.stack([after(1, 0), after(0, 1)], axis=1), before)
+    other, stance = np.linalg.solve(np.stack([after(1.0, 0.0), after(0.0, 1.0)], axis=1), before)
     return np.array([b, a, stance, other])
 
 
@@ -200,9 +200,7 @@ def compass_gait(
     zero = jnp.zeros_like(stance)
     q = jnp.stack([zero, zero, stance, stance - between])
     v = jnp.stack([zero, zero, rate, rate - rate_between])
-    args = CompassGaitArgs(
-        hip_mass, leg_mass, leg_inertia, leg_length, center, gravity, slope
-    )
+    args = CompassGaitArgs(hip_mass, leg_mass, leg_inertia, leg_length, center, gravity, slope)
     return Problem(
         "compass-gait",
         system=MechanicalSystem(_mass, _stance, _force),

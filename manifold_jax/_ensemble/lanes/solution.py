@@ -12,7 +12,6 @@ from jaxtyping import Array, PyTree
 
 from ..._base.compat import is_okay, nonlinear_failure, number_of_result
 from ..._resets.record import Resets
-from ..._solve.resets import NO_STATE_AFTER, TOO_MANY_RESETS
 from ..._solve.outcome import (
     is_unusable_start,
     is_without_time,
@@ -21,6 +20,7 @@ from ..._solve.outcome import (
     NOT_FINITE_START,
     UNUSABLE_START,
 )
+from ..._solve.resets import NO_STATE_AFTER, TOO_MANY_RESETS
 
 
 class EnsembleSolution(eqx.Module):
