@@ -606,3 +606,68 @@ def test_failures_have_a_code_and_a_message():
     assert sol.result == dfx.RESULTS.nonlinear_divergence
     with pytest.raises(Exception, match="could not be moved onto the manifold"):
         swing(P, SOLVERS["projected"], resets=(nowhere,))
+
+
+def test_an_event_that_a_jump_causes():
+    """Its time, which is that of the jump, and the states have the derivatives of the closed form."""
+    first = mj.Reset(
+        lambda t, y, p: y[0] - p,
+        lambda t, y, p: jnp.stack([y[0], 1.0 + 0.3 * p * y[0]]),
+        direction=True,
+    )
+    second = mj.Reset(
+        lambda t, y, p: y[1] + 0.1 * y[0],
+        lambda t, y, p: jnp.stack([2.0 * y[0] + 3.0 * t, y[1] + y[0]]),
+        direction=True,
+    )
+
+    def solve(p):
+        sol = mj.diffeqsolve(
+            dfx.ODETerm(lambda t, y, p: jnp.stack([jnp.ones(()), 0.2 * y[0]])),
+            dfx.Tsit5(),
+            0.0,
+            2.0,
+            0.1,
+            jnp.array([0.0, -1.0]),
+            p,
+            stepsize_controller=PID,
+            resets=(first, second),
+            max_resets=5,
+        )
+        return sol.ys[0], sol.resets.times[1], sol.resets.number
+
+    def exact(p):
+        """Both at the time `p`; then x = 5 p + (t - p), and y grows by its integral."""
+        x = 5.0 * p
+        left = 2.0 - p
+        y = 1.0 + 0.3 * p * p + p + 0.2 * (x * left + left**2 / 2)
+        return jnp.stack([x + left, y]), p
+
+    p = jnp.array(1.1)
+    state, time, number = solve(p)
+    assert number == 2
+    for mode in (jax.jacfwd, jax.jacrev):
+        for ours, slope in zip(mode(lambda p: solve(p)[:2])(p), jax.jacfwd(exact)(p), strict=True):
+            np.testing.assert_allclose(ours, slope, rtol=1e-11)
+    np.testing.assert_allclose(state, exact(p)[0], rtol=1e-12)
+    np.testing.assert_allclose(time, p, rtol=1e-14)
+
+
+def test_an_event_at_which_no_step_ends():
+    """A field with noise, so that every attempt to end a step at the event ends next to it."""
+    noisy = lambda t, y, args: jnp.stack([-1.0 + 1e-6 * jnp.sin(1e13 * t)])
+    up = mj.Reset(lambda t, y, args: y[0], lambda t, y, args: y + 1.0, direction=False)
+    sol = mj.diffeqsolve(
+        dfx.ODETerm(noisy),
+        dfx.Tsit5(),
+        0.0,
+        3.3,
+        0.5,
+        jnp.array([0.7]),
+        resets=(up,),
+        max_resets=10,
+    )
+    assert sol.resets.number == 3
+    np.testing.assert_allclose(sol.resets.times[:3], [0.7, 1.7, 2.7], atol=1e-5)
+    np.testing.assert_allclose(sol.resets.before[:3, 0], 0, atol=1e-5)
+    assert sol.stats["num_steps"] < 80

@@ -170,7 +170,9 @@ class Solve(NamedTuple):
             return after, None
         y = self.resetting.end_of_step(start, end, state.y, after.y)
         which = jnp.maximum(number, 0)
-        jump = self.resetting.jump(self.terms, number >= 0, which, end, end, y, after.memory)
+        jump = self.resetting.jump(
+            self.terms, number >= 0, which, (start, end), end, y, after.memory
+        )
         return State(jump.after, jump.memory), Event(jump.time, jump.before, jump.after)
 
 

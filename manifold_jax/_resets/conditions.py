@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from .._base.compat import nondifferentiable
 from .._base.shapes import are_alike, shapes
-from .._base.types import Args, FloatScalar, IntScalar, RealScalarLike, Y
+from .._base.types import Args, BoolScalar, FloatScalar, IntScalar, RealScalarLike, Y
 from .reset import Reset, ResetAt
 
 
@@ -70,6 +70,10 @@ class Conditions(eqx.Module):
             return jnp.where(value, 1, -1).astype(t.dtype) if boolean else value.astype(t.dtype)
 
         return jnp.stack([value(*of) for of in zip(self.resets, self.is_boolean, strict=True)])
+
+    def is_known(self, number: IntScalar) -> BoolScalar:
+        """Whether the times of the reset `number` are known before the solve."""
+        return jnp.asarray([isinstance(r, ResetAt) for r in self.resets])[number]
 
     def distance(self, number: IntScalar, t: FloatScalar, y: Y) -> FloatScalar:
         """Return a function of `t` and `y` that is zero at the event `number`; for a Boolean condition it is

@@ -8,18 +8,26 @@ import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 
-from .._base.types import FloatScalar, Y
+from .._base.types import FloatScalar, IntScalar, Y
+from .at_start import EventAtStart
 from .record import ResetRecord
 from .solver import Report
 
 
+# So often a step is shortened for an event before rounding is taken for the reason that it does not end
+# there; it is then made to end before the event, by so many units of rounding and more from try to try.
+_MOST_ATTEMPTS = 4
+_EARLIER = 16
+
+
 class ResettingState(eqx.Module):
-    """The state of the controller inside, the step that was shortened for an event (0 for none), and the
-    resets so far."""
+    """The state of the controller inside, the step that was shortened for an event (0 for none) and how
+    often, and the resets so far."""
 
     inner: Any
     shortened: FloatScalar
     shortened_end: FloatScalar
+    attempts: IntScalar
     record: ResetRecord
 
 
@@ -36,7 +44,7 @@ class ResettingController(dfx.AbstractStepSizeController):
         first, inner = self.controller.init(terms, t0, t1, y0, dt0, args, func, error_order)
         zero = jnp.zeros_like(t0)
         record = ResetRecord.empty(self.max_resets, t0, y0)
-        return first, ResettingState(inner, zero, zero, record)
+        return first, ResettingState(inner, zero, zero, jnp.zeros((), jnp.int32), record)
 
     def adapt_step_size(
         self, t0, t1, y0: Y, y1_candidate: Y, args, y_error: Report, error_order, controller_state
@@ -46,7 +54,12 @@ class ResettingController(dfx.AbstractStepSizeController):
             t0, t1, y0, y1_candidate, args, y_error.error, error_order, state.inner
         )
         at_event = keep & met.ends_step
-        repeated = keep & met.happens & ~at_event
+        aimed = keep & met.happens & ~at_event
+        # Rounding may keep steps from ending where the event is: then the jump is made at the start of
+        # the step after one that ends just before it.
+        gives_up = aimed & (state.attempts >= _MOST_ATTEMPTS) & (met.target >= t0)
+        stops_before = gives_up & (met.target >= t1)
+        repeated = aimed & ~stops_before
         # Sizes have no derivatives; the time of the event has one.
         time, length = lax.stop_gradient((met.time, t1 - t0))
         resumed = at_event & (state.shortened > 0)
@@ -54,17 +67,25 @@ class ResettingController(dfx.AbstractStepSizeController):
             resumed &= state.shortened_end > time
         following = jnp.where(resumed, self._resumed(state, time, next_t1), next_t1)
         following = jnp.where(at_event, jnp.maximum(following, time), following)
+        part = _EARLIER * jnp.finfo(time.dtype).eps
+        part *= 4.0 ** (state.attempts - _MOST_ATTEMPTS).astype(time.dtype)
+        target = jnp.where(gives_up, met.target - part * (time - t0), met.target)
         next_t0 = jnp.where(repeated, t0, jnp.where(at_event, met.time, next_t0))
-        next_t1 = jnp.where(repeated, met.target, following)
+        next_t1 = jnp.where(repeated, target, following)
+        told = EventAtStart(stops_before, met.number, met.irregular, jnp.asarray(True))
+        at_start = told.end_of_step(lax.stop_gradient(t1), met.sides.size)
+        next_t1 = jnp.where(stops_before, at_start, next_t1)
         if not self._is_clipped:  # the controller inside does not see steps that were shortened
             inner = _where(resumed, state.inner, inner)
-        inner = _where(repeated, state.inner, inner)
+        inner = _where(aimed, state.inner, inner)
         first = repeated & (state.shortened == 0)
-        ends_search = keep & ~repeated & ~at_event
+        ends_search = keep & ~aimed & ~at_event
         kept = jnp.where(ends_search, 0, state.shortened)
         shortened = jnp.where(first, length, kept)
         end = jnp.where(first, lax.stop_gradient(t1), state.shortened_end)
-        state = ResettingState(inner, shortened, end, state.record.including(at_event, met))
+        attempts = jnp.where(repeated, state.attempts + 1, 0)
+        record = state.record.including(at_event, met)
+        state = ResettingState(inner, shortened, end, attempts, record)
         return keep & ~repeated, next_t0, next_t1, made_jump, state, result
 
     @property

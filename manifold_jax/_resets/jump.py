@@ -1,5 +1,6 @@
 """One reset: the time of its event and the states before and after it, with their derivatives."""
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import diffrax as dfx
@@ -15,6 +16,7 @@ from .._base.types import BoolScalar, FloatScalar, IntScalar, Y
 from .._rosenbrock import MassMatrixTerm
 from .._solver.base import AbstractManifoldSolver
 from .._solver.unconstrained import Unconstrained
+from .at_start import EventAtStart
 from .conditions import Conditions
 
 
@@ -34,25 +36,42 @@ def jump_at_end(
     solver: dfx.AbstractSolver,
     terms: Any,
     number: IntScalar,
-    end: FloatScalar,
+    step: tuple[FloatScalar, FloatScalar],
     time: FloatScalar,
     y: Y,
 ) -> Jump:
     """Make the reset `number` at the end of a step, with the derivative of the time of its event.
 
-    The step ends at `end`, which is held fixed as that of every other step, in the state `y`. The event
-    is at `time`, equal to it up to rounding, and by an amount that depends on parameters.
+    The step ends in the state `y`, at a time that is held fixed as that of every other step. The event
+    is at `time`, equal to it up to rounding, and by an amount that depends on parameters. That of a step of
+    negative length is at its start, which may depend on parameters.
     """
     direction = time_direction(terms)
-    shifted = lambda end, y: _time_and_state_of_event(conditions, terms, number, end, y)
-    time, before = known_value(shifted, (time, y), lax.stop_gradient(end), y)
+    start, end = step
+    told = EventAtStart.told_by(*lax.stop_gradient(step), len(conditions))
+    end = jnp.where(told.happens, start, lax.stop_gradient(end))
+    is_caused = told.happens & ~told.crosses & ~conditions.is_known(number)
+
+    def shifted(end: FloatScalar, y: Y) -> tuple[FloatScalar, Y]:
+        def distance(t: FloatScalar, y: Y) -> FloatScalar:
+            # What another jump causes happens at the time of that.
+            crossed = conditions.distance(number, t * direction, y)
+            return jnp.where(is_caused, t - end, crossed)
+
+        return _time_and_state_of_event(conditions, terms, distance, end, y)
+
+    time, before = known_value(shifted, (time, y), end, y)
     after = conditions.jump(number, time * direction, before)
     after, success = _consistent(conditions, solver, terms, time * direction, after)
     return Jump(time, before, after, success & is_finite(after))
 
 
 def _time_and_state_of_event(
-    conditions: Conditions, terms: Any, number: IntScalar, end: FloatScalar, y: Y
+    conditions: Conditions,
+    terms: Any,
+    distance: Callable[[FloatScalar, Y], FloatScalar],
+    end: FloatScalar,
+    y: Y,
 ) -> tuple[FloatScalar, Y]:
     """Return `end` and `y` as functions of everything that the event depends on.
 
@@ -60,9 +79,7 @@ def _time_and_state_of_event(
     flow over such a small time is a step of the midpoint rule: exact for first and second derivatives
     with respect to `d`, as is `d` after two iterations `d - distance / rate` from 0.
     """
-    direction = time_direction(terms)
     field = _field(terms, conditions.args)
-    distance = lambda t, y: conditions.distance(number, t * direction, y)
     rate = jax.jvp(distance, (end, y), (jnp.ones_like(end), field(end, y)))[1]
     rate = lax.stop_gradient(jnp.where(rate == 0, 1, rate))
     y = conditions.refuse_derivative(end, y)

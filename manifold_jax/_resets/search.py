@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from .._base.types import BoolScalar, FloatScalar, IntScalar, Y
 from .._jaxpr.small_products import with_sums
+from .at_start import EventAtStart
 from .bracket import root_in_bracket
 
 
@@ -272,19 +273,18 @@ class EventSearch(NamedTuple):
         infinite = lambda sign: jnp.where(sign == 0, 0, sign * jnp.inf)
         sides = jnp.where(near, infinite(signs[place, jnp.arange(place.size)]), samples.end)
         target = jnp.maximum(_before(earliest), _after(step.t0))
-        unit = _unit(step.t0)
-        code = number + 1 + place.size * irregular[number].astype(number.dtype)
-        target = jnp.where(at_once[number], step.t0 - code.astype(unit.dtype) * unit, target)
-        # A step of negative length is one that says which event happens at its start.
-        told = jnp.round((step.t0 - step.t1) / unit).astype(jnp.int32) - 1
-        is_told = step.is_negative
-        told_irregular = told >= place.size
+        at_start = EventAtStart(
+            at_once[number], number, irregular[number], crosses=jnp.asarray(False)
+        )
+        target = jnp.where(at_start.happens, at_start.end_of_step(step.t0, place.size), target)
+        told = EventAtStart.told_by(step.t0, step.t1, place.size)
+        is_told = told.happens
         waiting = jnp.where(jnp.isinf(history.sides), history.sides, samples.end)
-        number = jnp.where(is_told, jnp.clip(told % place.size, 0, place.size - 1), number)
+        number = jnp.where(is_told, told.number, number)
         return Found(
             happens | is_told,
             is_at_end | is_told,
-            jnp.where(is_told, told_irregular, irregular[number]),
+            jnp.where(is_told, told.irregular, irregular[number]),
             number,
             target,
             jnp.where(is_told, step.t0, _after(step.t1)),
@@ -305,9 +305,3 @@ def _before(t: FloatScalar) -> FloatScalar:
 
 def _after(t: FloatScalar) -> FloatScalar:
     return jnp.nextafter(t, jnp.asarray(jnp.inf, t.dtype))
-
-
-def _unit(t: FloatScalar) -> FloatScalar:
-    """Return a length that is negligible at this time, by which steps of negative length count."""
-    info = jnp.finfo(t.dtype)
-    return jnp.maximum(2 * info.eps * jnp.abs(t), jnp.sqrt(jnp.asarray(info.tiny, t.dtype)))

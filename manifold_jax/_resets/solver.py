@@ -189,7 +189,8 @@ class Resetting(dfx.AbstractWrappedSolver):
             found = held(find)
             exhausted = found.ends_step & (jnp.sum(history.happened) >= self.max_resets)
             jumps = found.ends_step & ~exhausted
-            jump = self.jump(terms, jumps, found.number, given[1], found.time, y1, memory)
+            ends = jnp.asarray(t0), jnp.asarray(t1)
+            jump = self.jump(terms, jumps, found.number, ends, found.time, y1, memory)
             return Met.of(found, exhausted, jump)
 
         idle = Met.without_event(given[1], y1, memory, history)
@@ -207,7 +208,7 @@ class Resetting(dfx.AbstractWrappedSolver):
         terms: Any,
         jumps: BoolScalar,
         number: IntScalar,
-        end: FloatScalar,
+        step: tuple[FloatScalar, FloatScalar],
         time: FloatScalar,
         y: Y,
         memory: Any,
@@ -215,10 +216,10 @@ class Resetting(dfx.AbstractWrappedSolver):
         """Return the jump at the end of a step, or the state as it is without one."""
 
         def made() -> Jump:
-            jump = jump_at_end(self.conditions, self.inner, terms, number, end, time, y)
+            jump = jump_at_end(self.conditions, self.inner, terms, number, step, time, y)
             if memory is None:
                 return jump
-            soon = jump.time + jnp.ones_like(end)
+            soon = jump.time + jnp.ones_like(time)
             inner = self.inner.init(terms, jump.time, soon, jump.after, self.conditions.args)
             return jump._replace(memory=memory_of(inner))
 
