@@ -8,10 +8,10 @@ import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 
-from .._base.types import FloatScalar, IntScalar, Y
+from .._base.types import BoolScalar, FloatScalar, IntScalar, Y
 from .at_start import EventAtStart
 from .record import ResetRecord
-from .solver import Report
+from .solver import Met, Report
 
 
 # So often a step is shortened for an event before rounding is taken for the reason that it does not end
@@ -55,26 +55,18 @@ class ResettingController(dfx.AbstractStepSizeController):
         )
         at_event = keep & met.ends_step
         aimed = keep & met.happens & ~at_event
-        # Rounding may keep steps from ending where the event is: then the jump is made at the start of
-        # the step after one that ends just before it.
-        gives_up = aimed & (state.attempts >= _MOST_ATTEMPTS) & (met.target >= t0)
-        stops_before = gives_up & (met.target >= t1)
-        repeated = aimed & ~stops_before
         # Sizes have no derivatives; the time of the event has one.
         time, length = lax.stop_gradient((met.time, t1 - t0))
+        stops_before, target = _next_end(met, state, jnp.asarray(t0), jnp.asarray(t1))
+        stops_before &= aimed
+        repeated = aimed & ~stops_before
         resumed = at_event & (state.shortened > 0)
         if self._has_prescribed_times:
             resumed &= state.shortened_end > time
         following = jnp.where(resumed, self._resumed(state, time, next_t1), next_t1)
         following = jnp.where(at_event, jnp.maximum(following, time), following)
-        part = _EARLIER * jnp.finfo(time.dtype).eps
-        part *= 4.0 ** (state.attempts - _MOST_ATTEMPTS).astype(time.dtype)
-        target = jnp.where(gives_up, met.target - part * (time - t0), met.target)
         next_t0 = jnp.where(repeated, t0, jnp.where(at_event, met.time, next_t0))
-        next_t1 = jnp.where(repeated, target, following)
-        told = EventAtStart(stops_before, met.number, met.irregular, jnp.asarray(True))
-        at_start = told.end_of_step(lax.stop_gradient(t1), met.sides.size)
-        next_t1 = jnp.where(stops_before, at_start, next_t1)
+        next_t1 = jnp.where(aimed, target, following)
         if not self._is_clipped:  # the controller inside does not see steps that were shortened
             inner = _where(resumed, state.inner, inner)
         inner = _where(aimed, state.inner, inner)
@@ -104,6 +96,26 @@ class ResettingController(dfx.AbstractStepSizeController):
         if self._has_prescribed_times:
             return state.shortened_end
         return time + state.shortened
+
+
+def _next_end(
+    met: Met, state: ResettingState, t0: FloatScalar, t1: FloatScalar
+) -> tuple[BoolScalar, FloatScalar]:
+    """Return for a step with an event that is not at its end whether it is kept nevertheless, and where the
+    next one ends.
+
+    A step is made again to end at the event. If rounding keeps steps from ending there it is made to end
+    just before it, and the step after it says that the event is at its start.
+    """
+    t0, t1 = lax.stop_gradient((t0, t1))
+    gives_up = (state.attempts >= _MOST_ATTEMPTS) & (met.target >= t0)
+    part = _EARLIER * jnp.finfo(t1.dtype).eps
+    part *= 4.0 ** (state.attempts - _MOST_ATTEMPTS).astype(t1.dtype)
+    target = jnp.where(gives_up, met.target - part * (t1 - t0), met.target)
+    stops_before = gives_up & (met.target >= t1)
+    told = EventAtStart(stops_before, met.number, met.irregular, crosses=jnp.asarray(True))
+    told_by = told.end_of_step(t1, met.sides.size)
+    return stops_before, jnp.where(stops_before, told_by, target)
 
 
 def _innermost(controller: Any) -> Any:
