@@ -653,6 +653,35 @@ def test_an_event_that_a_jump_causes():
     np.testing.assert_allclose(time, p, rtol=1e-14)
 
 
+def test_each_of_many_events_at_one_time_happens_once():
+    """Whether it is the time that they have in common or a jump that causes them; one that another
+    jump undoes does not happen."""
+    log = lambda k: lambda t, y, args: y.at[1].set(10 * y[1] + k)
+    field = dfx.ODETerm(lambda t, y, args: jnp.array([1.0, 0.0, 0.0]))
+    solve = lambda resets: mj.diffeqsolve(
+        field, dfx.Tsit5(), 0.0, 1.0, 0.3, jnp.zeros(3), resets=resets
+    )
+    at_half = [
+        mj.Reset(lambda t, y, args: t - 0.5, log(float(k)), direction=True) for k in range(1, 6)
+    ]
+    sol = solve(tuple(at_half))
+    assert sol.ys[0, 1] == 12345
+    assert sol.resets.number == 5
+    sets = mj.Reset(lambda t, y, args: y[0] - 0.5, lambda t, y, args: y.at[2].set(1.0))
+    follow = [
+        mj.Reset(lambda t, y, args, k=k: y[2] - 0.1 * k, log(float(k)), direction=True)
+        for k in (1, 2, 3)
+    ]
+    sol = solve((follow[0], sets, *follow[1:]))
+    assert sol.resets.indices[:5].tolist() == [1, 0, 2, 3, -1]
+    assert sol.ys[0, 1] == 123
+    undoes = mj.Reset(
+        lambda t, y, args: y[2] - 0.15, lambda t, y, args: y.at[2].set(0.0), direction=True
+    )
+    sol = solve((sets, undoes, *follow))
+    assert sol.resets.indices[:3].tolist() == [0, 1, -1]
+
+
 def test_an_event_at_which_no_step_ends():
     """A field with noise, so that every attempt to end a step at the event ends next to it."""
     noisy = lambda t, y, args: jnp.stack([-1.0 + 1e-6 * jnp.sin(1e13 * t)])

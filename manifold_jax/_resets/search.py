@@ -137,7 +137,7 @@ class EventSearch(NamedTuple):
     def first(self, step: SearchedStep, samples: SampledConditions, history: History) -> Found:
         """Return the first event of a step."""
         noise = self._noise(step, samples)
-        before, start, on_surface = self._start(samples, history, noise)
+        before, start, on_surface = self._start(step, samples, history, noise)
         # A jump changed the sign, or the state leaves the surface on which it began: at once.
         leaves = (before != 0) & (start != 0) & self._crosses(before, start)
         first = jnp.where(jnp.abs(samples.values[1]) > 4 * noise, jnp.sign(samples.values[1]), 0)
@@ -155,7 +155,13 @@ class EventSearch(NamedTuple):
         roots = jnp.where(self.ignored | at_end | is_far, jnp.inf, roots)
         near = self._is_at_end(step, samples, roots, noise, rounding) & ~at_once
         irregular = self._is_irregular(samples, near, at_once & on_surface)
-        return self._chosen(step, samples, history, roots, near, at_once, irregular, signs, place)
+        # What jumps have caused already, or is at the same time, stays so until its own jump.
+        infinite = lambda sign: jnp.where(sign == 0, 0, sign * jnp.inf)
+        waiting = jnp.where(leaves, infinite(before), infinite(start))
+        waiting = jnp.where(jnp.isinf(history.sides), history.sides, waiting)
+        sides = jnp.where(near, infinite(signs[place, jnp.arange(place.size)]), samples.end)
+        sides = jnp.where(step.is_negative, waiting, sides)
+        return self._chosen(step, roots, near, at_once, irregular, sides)
 
     def _crosses(self, before: Array, after: Array) -> Array:
         up, down = (before < 0) & (after >= 0), (before > 0) & (after <= 0)
@@ -163,7 +169,7 @@ class EventSearch(NamedTuple):
         return (up & (directions >= 0)) | (down & (directions <= 0))
 
     def _start(
-        self, samples: SampledConditions, history: History, noise: Array
+        self, step: SearchedStep, samples: SampledConditions, history: History, noise: Array
     ) -> tuple[Array, ...]:
         """Return the signs just before and just after the start of the step, and which conditions are
         zero there up to rounding; the sign of these is that of their rate of change."""
@@ -176,6 +182,7 @@ class EventSearch(NamedTuple):
         least = 30 * _JUST_AFTER * jnp.abs(samples.values[1]) * self.parts
         least = jnp.maximum(least, 1e-10 * largest) * _JUST_AFTER
         change = jnp.where(jnp.abs(change) <= least, 0, change)
+        change = jnp.where(step.is_negative, self._rates(step), change)
         start = jnp.sign(jnp.where(on_surface, change, samples.values[0]))
         # One that was zero before the jump as well is taken to have been on the side it can leave.
         touching = jnp.where(on_surface, -self.directions, 0)
@@ -183,17 +190,24 @@ class EventSearch(NamedTuple):
         unknown = jnp.isnan(history.sides) | ~history.after_reset
         return jnp.where(unknown, 0, before), start, on_surface
 
+    def _rates(self, step: SearchedStep) -> Float[Array, " resets"]:
+        """Return the rates of change at the start of a step of negative length, 0 if that may be rounding."""
+        fraction = jnp.zeros_like(step.t0)
+        _, velocity = jax.jvp(step.path, (fraction,), (-jnp.ones_like(fraction),))
+        passed = -step.length
+        rates = lambda moved: jax.jvp(self.values, (step.t0, step.y0), moved)[1]
+        sizes = jnp.abs(jax.vmap(rates)(_with_signs((passed, velocity))))
+        rate = rates((passed, velocity))
+        return jnp.where(jnp.abs(rate) <= 1e-10 * jnp.max(sizes, axis=0), 0, rate)
+
     def _noise(self, step: SearchedStep, samples: SampledConditions) -> Float[Array, " resets"]:
-        """Return how much rounding of the state may change the conditions at the end of the step."""
-        random = np.random.default_rng(0)
+        """Return how much rounding of time and state may change the conditions at the end of the step."""
 
-        def perturbed(leaf: Array) -> Array:
-            signs = random.choice([-1.0, 1.0], (_PERTURBATIONS, *leaf.shape))
-            eps = 16 * jnp.finfo(leaf.dtype).eps
-            return leaf[None] * (1 + eps * jnp.asarray(signs, leaf.dtype))
+        def perturbed(x: Array, signed: Array) -> Array:
+            return x[None] + 16 * jnp.finfo(x.dtype).eps * signed
 
-        states = jtu.tree_map(perturbed, step.y1)
-        values = jax.vmap(lambda y: self.values(step.t1, y))(states)
+        at = step.t1, step.y1
+        values = jax.vmap(self.values)(*jtu.tree_map(perturbed, at, _with_signs(at)))
         change = jnp.max(jnp.abs(values - samples.end[None]), axis=0)
         return jnp.where(self.is_boolean, 0, change)
 
@@ -253,14 +267,11 @@ class EventSearch(NamedTuple):
     def _chosen(
         self,
         step: SearchedStep,
-        samples: SampledConditions,
-        history: History,
         roots: Array,
         near: Array,
         at_once: Array,
         irregular: Array,
-        signs: Array,
-        place: Array,
+        sides: Array,
     ) -> Found:
         """Choose the earliest event: of several at one time the first."""
         earliest = jnp.min(roots)
@@ -269,17 +280,13 @@ class EventSearch(NamedTuple):
         # Those at the same time are all that are at the end of the step, or all at its start.
         same = jnp.where(is_at_end, near, roots == earliest)
         number = jnp.argmax(same & happens).astype(jnp.int32)
-        place = jnp.minimum(place, self.parts)
-        infinite = lambda sign: jnp.where(sign == 0, 0, sign * jnp.inf)
-        sides = jnp.where(near, infinite(signs[place, jnp.arange(place.size)]), samples.end)
         target = jnp.maximum(_before(earliest), _after(step.t0))
         at_start = EventAtStart(
             at_once[number], number, irregular[number], crosses=jnp.asarray(False)
         )
-        target = jnp.where(at_start.happens, at_start.end_of_step(step.t0, place.size), target)
-        told = EventAtStart.told_by(step.t0, step.t1, place.size)
+        target = jnp.where(at_start.happens, at_start.end_of_step(step.t0, roots.size), target)
+        told = EventAtStart.told_by(step.t0, step.t1, roots.size)
         is_told = told.happens
-        waiting = jnp.where(jnp.isinf(history.sides), history.sides, samples.end)
         number = jnp.where(is_told, told.number, number)
         return Found(
             happens | is_told,
@@ -288,7 +295,7 @@ class EventSearch(NamedTuple):
             number,
             target,
             jnp.where(is_told, step.t0, _after(step.t1)),
-            jnp.where(is_told, waiting, sides).at[number].set(jnp.nan),
+            sides.at[number].set(jnp.nan),
         )
 
 
@@ -297,6 +304,17 @@ def _split(fractions: np.ndarray, y: Y) -> list[np.ndarray]:
     operations of a loop on such arrays one after the other instead of handing them to threads."""
     size = sum(leaf.size for leaf in jtu.tree_leaves(y))
     return np.array_split(fractions, 2) if size <= 9 else [fractions]
+
+
+def _with_signs(tree: Any) -> Any:
+    """Return several copies of a tree, whose numbers have random signs."""
+    random = np.random.default_rng(0)
+
+    def signed(x: Array) -> Array:
+        signs = random.choice([-1.0, 1.0], (_PERTURBATIONS, *x.shape))
+        return x[None] * jnp.asarray(signs, x.dtype)
+
+    return jtu.tree_map(signed, tree)
 
 
 def _before(t: FloatScalar) -> FloatScalar:
