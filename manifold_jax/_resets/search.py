@@ -158,7 +158,6 @@ class EventSearch(NamedTuple):
         # What jumps have caused already, or is at the same time, stays so until its own jump.
         infinite = lambda sign: jnp.where(sign == 0, 0, sign * jnp.inf)
         waiting = jnp.where(leaves, infinite(before), infinite(start))
-        waiting = jnp.where(jnp.isinf(history.sides), history.sides, waiting)
         sides = jnp.where(near, infinite(signs[place, jnp.arange(place.size)]), samples.end)
         sides = jnp.where(step.is_negative, waiting, sides)
         return self._chosen(step, roots, near, at_once, irregular, sides)

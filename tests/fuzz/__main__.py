@@ -8,7 +8,8 @@ state, a solver, a controller, what is saved, the direction of time, the approac
 fail. `--only INDEX` runs one structure of the same seed again.
 
 `--kind dae` reduces random differential-algebraic equations with `manifold_jax.reduce_dae`;
-`--kind store` damages stored ensembles at random, one copy for each draw.
+`--kind store` damages stored ensembles at random, one copy for each draw;
+`--kind reset` solves random equations with jumps of the state at random events.
 """
 
 import collections
@@ -46,6 +47,7 @@ class Kind(enum.StrEnum):
     SOLVE = "solve"
     DAE = "dae"
     STORE = "store"
+    RESET = "reset"
 
 
 def run(

@@ -13,7 +13,7 @@ import numpy as np
 
 from benchmarks.tools.measure import use_double_precision
 
-from . import daes, stores
+from . import daes, resets, stores
 from .checks import (
     check_accuracy,
     check_events,
@@ -29,13 +29,14 @@ from .daes import Equations, equations
 from .gradients import check_gradients
 from .lanes import amplification, draw, reference_paths, take, with_events, with_failing_lane
 from .program import solve
+from .resets import Switched, switched
 from .stores import Store, store
 from .structure import Structure, structure
 
 
-DRAWN = {"solve": structure, "dae": equations, "store": store}
+DRAWN = {"solve": structure, "dae": equations, "store": store, "reset": switched}
 # What is checked in other ways than as a batch of solves.
-CHECKS = {Equations: daes.examine, Store: stores.examine}
+CHECKS = {Equations: daes.examine, Store: stores.examine, Switched: resets.examine}
 
 
 def examine(one: Any, draws: int) -> dict[str, Any]:
