@@ -10,8 +10,8 @@ import jax.tree_util as jtu
 
 from .._base.types import BoolScalar, FloatScalar, IntScalar, Y
 from .at_start import EventAtStart
+from .met import Met, Report
 from .record import ResetRecord
-from .solver import Met, Report
 
 
 # So often a step is shortened for an event before rounding is taken for the reason that it does not end

@@ -11,34 +11,12 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from .._base.types import BoolScalar, FloatScalar, IntScalar, Y
-from .._jaxpr.small_products import with_sums
 from .at_start import EventAtStart
 from .bracket import root_in_bracket
+from .samples import BEYOND, SampledConditions, SearchedStep
 
 
-# Beyond its end a step is searched for this part of its length: the event at which it was meant to end
-# may come a little later.
-_BEYOND = 0.01
-_JUST_AFTER = 1e-6  # part of a step in which the direction of a condition is seen at its start
 _PERTURBATIONS = 4
-
-
-class SearchedStep(NamedTuple):
-    """An attempted step in the time of Diffrax, and its dense output at a fraction of the step."""
-
-    t0: FloatScalar
-    t1: FloatScalar
-    y0: Y
-    y1: Y
-    path: Callable[[FloatScalar], Y]
-
-    @property
-    def length(self) -> FloatScalar:
-        return self.t1 - self.t0
-
-    @property
-    def is_negative(self) -> BoolScalar:
-        return self.t1 < self.t0
 
 
 class History(eqx.Module):
@@ -57,26 +35,6 @@ class History(eqx.Module):
         never, zero = jnp.zeros(count, jnp.int32), jnp.zeros((), jnp.int32)
         sides = jnp.zeros(count, dtype)
         return History(jnp.asarray(True), sides, never, zero, jnp.asarray(False))
-
-
-class SampledConditions(NamedTuple):
-    """The values of the conditions at fractions of a step: at the ends of equal parts, a little beyond
-    the end, and just after the start."""
-
-    fractions: np.ndarray
-    values: Float[Array, "samples resets"]
-
-    @property
-    def in_order(self) -> Float[Array, "samples resets"]:
-        return self.values[:-1]
-
-    @property
-    def inside(self) -> Float[Array, "parts resets"]:
-        return self.values[1:-2]
-
-    @property
-    def end(self) -> Float[Array, " resets"]:
-        return self.values[-3]
 
 
 class Found(NamedTuple):
@@ -106,38 +64,20 @@ class EventSearch(NamedTuple):
     def is_known(self) -> Bool[Array, " resets"]:
         return jnp.isfinite(self.known_times)
 
-    def sample(self, step: SearchedStep) -> SampledConditions:
-        inside = np.arange(self.parts + 1) / self.parts
-        fractions = np.concatenate([inside, [1 + _BEYOND, _JUST_AFTER]])
-        where = fractions.astype(step.t0.dtype)
-        states = [with_sums(jax.vmap(step.path), part) for part in _split(where, step.y0)]
-        states = jtu.tree_map(lambda *parts: jnp.concatenate(parts), *states)
-        n = self.parts
-        join = lambda ys, y0, y1: jnp.concatenate([y0[None], ys[1:n], y1[None], ys[n + 1 :]])
-        states = jtu.tree_map(join, states, step.y0, step.y1)
-        times = step.t0 + step.length * where
-        values = jax.vmap(self.values)(times, states)
-        # One that touches zero only just has no other sign near by.
-        size = jnp.max(jnp.abs(values[1:n]), axis=0) if n > 1 else jnp.abs(values[0])
-        nothing = 4 * jnp.finfo(values.dtype).eps * size
-        end = jnp.where(jnp.abs(values[n]) <= nothing, 0, values[n])
-        return SampledConditions(
-            fractions, jnp.concatenate([values[:n], end[None], values[n + 1 :]])
-        )
-
     def may_find(
         self, step: SearchedStep, samples: SampledConditions, history: History
     ) -> BoolScalar:
         """Whether the step needs to be looked at: most steps have no event."""
         signs = jnp.sign(samples.in_order)
         changes = jnp.any(self._crosses(signs[:-1], signs[1:]))
-        is_known = jnp.any(self.known_times <= step.t1 + _BEYOND * step.length)
+        is_known = jnp.any(self.known_times <= step.t1 + BEYOND * step.length)
         return changes | is_known | step.is_negative | history.after_reset
 
     def first(self, step: SearchedStep, samples: SampledConditions, history: History) -> Found:
         """Return the first event of a step."""
-        noise = self._noise(step, samples)
-        before, start, on_surface = self._start(step, samples, history, noise)
+        noise, rate = self._sensitivity(step)
+        rate = jnp.where(step.is_negative, rate, samples.rate_just_after)
+        before, start, on_surface = self._start(samples, rate, history, noise)
         # A jump changed the sign, or the state leaves the surface on which it began: at once.
         leaves = (before != 0) & (start != 0) & self._crosses(before, start)
         first = jnp.where(jnp.abs(samples.values[1]) > 4 * noise, jnp.sign(samples.values[1]), 0)
@@ -149,7 +89,7 @@ class EventSearch(NamedTuple):
         roots = self._roots(step, samples, place, found & ~at_once, on_surface)
         roots = jnp.where(self.is_known, self.known_times, roots)
         roots = jnp.where(at_once, step.t0, roots)
-        is_far = (roots > step.t1 + _BEYOND * step.length) & ~at_once
+        is_far = (roots > step.t1 + BEYOND * step.length) & ~at_once
         rounding = jnp.finfo(step.t1.dtype).eps * jnp.maximum(jnp.abs(step.t0), jnp.abs(step.t1))
         at_end = roots >= self.end - 200 * rounding  # of the solve, where nothing happens any more
         roots = jnp.where(self.ignored | at_end | is_far, jnp.inf, roots)
@@ -168,7 +108,7 @@ class EventSearch(NamedTuple):
         return (up & (directions >= 0)) | (down & (directions <= 0))
 
     def _start(
-        self, step: SearchedStep, samples: SampledConditions, history: History, noise: Array
+        self, samples: SampledConditions, rate: Array, history: History, noise: Array
     ) -> tuple[Array, ...]:
         """Return the signs just before and just after the start of the step, and which conditions are
         zero there up to rounding; the sign of these is that of their rate of change."""
@@ -176,39 +116,30 @@ class EventSearch(NamedTuple):
         is_zero = lambda v: (jnp.abs(v) <= 4 * noise) | (jnp.abs(v) <= 1e-6 * largest)
         on_surface = history.after_reset & is_zero(samples.values[0])
         on_surface &= ~self.is_boolean & ~self.is_known
-        change = samples.values[-1] - samples.values[0]
-        # At rest it changes with the square of the time.
-        least = 30 * _JUST_AFTER * jnp.abs(samples.values[1]) * self.parts
-        least = jnp.maximum(least, 1e-10 * largest) * _JUST_AFTER
-        change = jnp.where(jnp.abs(change) <= least, 0, change)
-        change = jnp.where(step.is_negative, self._rates(step), change)
-        start = jnp.sign(jnp.where(on_surface, change, samples.values[0]))
+        start = jnp.sign(jnp.where(on_surface, rate, samples.values[0]))
         # One that was zero before the jump as well is taken to have been on the side it can leave.
         touching = jnp.where(on_surface, -self.directions, 0)
         before = jnp.where(is_zero(history.sides), touching, jnp.sign(history.sides))
         unknown = jnp.isnan(history.sides) | ~history.after_reset
         return jnp.where(unknown, 0, before), start, on_surface
 
-    def _rates(self, step: SearchedStep) -> Float[Array, " resets"]:
-        """Return the rates of change at the start of a step of negative length, 0 if that may be rounding."""
-        fraction = jnp.zeros_like(step.t0)
-        _, velocity = jax.jvp(step.path, (fraction,), (-jnp.ones_like(fraction),))
-        passed = -step.length
-        rates = lambda moved: jax.jvp(self.values, (step.t0, step.y0), moved)[1]
-        sizes = jnp.abs(jax.vmap(rates)(_with_signs((passed, velocity))))
-        rate = rates((passed, velocity))
-        return jnp.where(jnp.abs(rate) <= 1e-10 * jnp.max(sizes, axis=0), 0, rate)
-
-    def _noise(self, step: SearchedStep, samples: SampledConditions) -> Float[Array, " resets"]:
-        """Return how much rounding of time and state may change the conditions at the end of the step."""
-
-        def perturbed(x: Array, signed: Array) -> Array:
-            return x[None] + 16 * jnp.finfo(x.dtype).eps * signed
-
+    def _sensitivity(self, step: SearchedStep) -> tuple[Float[Array, " resets"], ...]:
+        """Return how much rounding of time and state may change the conditions at the end of the step, and
+        for a step of negative length, which has no extent, their rates of change, 0 if that may be
+        rounding."""
         at = step.t1, step.y1
-        values = jax.vmap(self.values)(*jtu.tree_map(perturbed, at, _with_signs(at)))
-        change = jnp.max(jnp.abs(values - samples.end[None]), axis=0)
-        return jnp.where(self.is_boolean, 0, change)
+        fraction = jnp.zeros_like(step.t0)
+        velocity = jax.jvp(step.path, (fraction,), (-jnp.ones_like(fraction),))[1]
+        motion = -step.length, velocity
+        tiny = jtu.tree_map(lambda x: 16 * jnp.finfo(x.dtype).eps * x, at)
+        single = jtu.tree_map(lambda x: x[None], motion)
+        parts = _with_signs(tiny), _with_signs(motion), single
+        directions = jtu.tree_map(lambda *x: jnp.concatenate(x), *parts)
+        changes = jax.vmap(lambda along: jax.jvp(self.values, at, along)[1])(directions)
+        largest = lambda x: jnp.max(jnp.abs(x), axis=0)
+        n, rate = _PERTURBATIONS, changes[-1]
+        rate = jnp.where(jnp.abs(rate) <= 1e-10 * largest(changes[n : 2 * n]), 0, rate)
+        return jnp.where(self.is_boolean, 0, largest(changes[:n])), rate
 
     def _roots(
         self,
@@ -254,7 +185,7 @@ class EventSearch(NamedTuple):
     def _is_irregular(self, samples: SampledConditions, near: Array, touching: Array) -> Array:
         """Return which events have no derivative: more than one at a time, or zeros with almost no slope."""
         # That at the end of the parabola through three samples.
-        a, b, end = _BEYOND, 1 / self.parts, samples.end
+        a, b, end = BEYOND, 1 / self.parts, samples.end
         right, left = (samples.values[-2] - end) / a, (end - samples.values[-4]) / b
         grazes = jnp.abs((right * b + left * a) / (a + b)) <= 1e-3 * jnp.max(
             jnp.abs(samples.inside), axis=0
@@ -296,13 +227,6 @@ class EventSearch(NamedTuple):
             jnp.where(is_told, step.t0, _after(step.t1)),
             sides.at[number].set(jnp.nan),
         )
-
-
-def _split(fractions: np.ndarray, y: Y) -> list[np.ndarray]:
-    """Split the samples where the arrays of each part then have at most 512 bytes: XLA for CPUs runs the
-    operations of a loop on such arrays one after the other instead of handing them to threads."""
-    size = sum(leaf.size for leaf in jtu.tree_leaves(y))
-    return np.array_split(fractions, 2) if size <= 9 else [fractions]
 
 
 def _with_signs(tree: Any) -> Any:
