@@ -14,7 +14,7 @@ import pytest
 ROOT = Path(__file__).parents[1]
 sys.path.append(str(ROOT))
 
-FOLDERS = ("dae_board", "peers", "speed", "tools")
+FOLDERS = ("dae_board", "peers", "sbml_events", "speed", "tools")
 MODULES = sorted(
     ".".join(path.relative_to(ROOT).with_suffix("").parts)
     for folder in FOLDERS
@@ -30,9 +30,11 @@ PEERS = ("casadi", "mujoco", "pydiffsol", "sksundae")
 SMALLEST = {
     "benchmarks.dae_board.__main__": dict(problems="linear: generator", quick=True, repeats=1),
     "benchmarks.peers.approaches": dict(problems="pendulum", repeats=1, quick=True),
+    "benchmarks.peers.impacts": dict(repeats=1, quick=True),
     "benchmarks.peers.mujoco_peers": dict(),
     "benchmarks.peers.pendulum_peers": dict(repeats=1),
     "benchmarks.peers.polymer": dict(bonds=6, long=1.0, repeats=1, quick=True),
+    "benchmarks.sbml_events.__main__": dict(numbers="00929"),
     "benchmarks.speed.accelerator": dict(
         sizes="4", lanes=2, repeats=1, problems="lorenz", precisions="double"
     ),

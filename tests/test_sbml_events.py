@@ -1,9 +1,15 @@
 """Cases with events of the SBML semantic test suite, against the published results."""
 
+import sys
+from pathlib import Path
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+
+
+sys.path.append(str(Path(__file__).parents[1]))
 
 from benchmarks.sbml_events.__main__ import difference_of_modes
 from benchmarks.sbml_events.cases import build, excess, read
