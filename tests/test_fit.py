@@ -22,7 +22,6 @@ from fit_cases import (
     START,
     TRUTH,
     TS,
-    TURN,
     Y0,
 )
 
@@ -355,7 +354,7 @@ HOLED = np.where(np.arange(31)[:, None] == 7, np.nan, GOOD)
         ),
         (dict(steps=0), ValueError, "`steps` must be a positive"),
         (dict(model=3.0), TypeError, "`model` must be a problem of the gallery"),
-        (dict(model=lambda p: TURN), TypeError, "must return a problem of the gallery"),
+        (dict(model=lambda p: CIRCLE), TypeError, "must return a problem of the gallery"),
         (dict(solver=mj.Projected(dfx.Tsit5(), CIRCLE)), TypeError, "`solver` must not hold"),
         (dict(solver=5), TypeError, "`solver` must be a Diffrax solver"),
         (dict(data=GOOD[:1], ts=TS[:1]), ValueError, "`ts` must have shape"),

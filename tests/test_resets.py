@@ -653,6 +653,32 @@ def test_an_event_that_a_jump_causes():
     np.testing.assert_allclose(time, p, rtol=1e-14)
 
 
+def test_gradient_of_a_value_saved_at_the_time_of_a_jump():
+    """At the start and inside, the value saved is the one after the jump, with its derivative."""
+    jump = mj.ResetAt([0.0, 1.0], lambda t, y, args: 3.0 * y + 1.0)
+
+    def saved(y0):
+        sol = mj.diffeqsolve(
+            dfx.ODETerm(lambda t, y, args: -y),
+            dfx.Tsit5(),
+            0.0,
+            2.0,
+            0.1,
+            y0,
+            saveat=dfx.SaveAt(t0=True, ts=jnp.array([0.0, 0.5, 1.0, 1.5, 2.0])),
+            stepsize_controller=PID,
+            resets=(jump,),
+        )
+        return sol.ys
+
+    decay = jnp.exp(-jnp.array([0.0, 0.5, 0.0, 0.5, 1.0]))
+    slope = jnp.concatenate(
+        [jnp.ones(1), jnp.array([3, 3, 9 / jnp.e, 9 / jnp.e, 9 / jnp.e]) * decay]
+    )
+    for mode in (jax.jacfwd, jax.jacrev):
+        np.testing.assert_allclose(mode(saved)(jnp.ones(())), slope, rtol=1e-8)
+
+
 def test_each_of_many_events_at_one_time_happens_once():
     """Whether it is the time that they have in common or a jump that causes them; one that another
     jump undoes does not happen."""

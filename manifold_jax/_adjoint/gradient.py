@@ -29,8 +29,15 @@ class RecordedStep(NamedTuple):
     end: Float[Array, "*steps"]
     jumped: Bool[Array, "*steps"] | None  # None if no steps begin after jumps
     reset: Int[Array, "*steps"] | None  # which reset is at its end, or -1; None without resets
+    begins_at_reset: Bool[Array, "*steps"] | None
     accepted: Bool[Array, "*steps"]
     state: Vectors  # from which the step was made
+
+    @property
+    def begins_anew(self) -> Bool[Array, "*steps"] | bool:
+        """Whether the state at its start is not the one at the end of the step before."""
+        at_reset = False if self.begins_at_reset is None else self.begins_at_reset
+        return self.begins_at_jump | at_reset
 
     @property
     def begins_at_jump(self) -> Bool[Array, "*steps"] | bool:

@@ -116,7 +116,8 @@ class Record(eqx.Module):
         resets: bool,
     ) -> "Record":
         """Return a record without steps. Its columns are the start and the end of a step, whether it begins
-        after a jump of the field, and which reset is at its end; the last two only where they are used."""
+        after a jump of the field, and twice the number of the reset at its end (-1 for none), one more if it
+        begins at a reset; the last two only where they are used."""
         packing = Packing.of(state)
         sizes = Sizes.of(packing.nbytes, max_steps, checkpoints)
         x = packing.pack(state)
@@ -179,7 +180,8 @@ def recording(record: Record, of: Callable[[Any], Any], run: Callable) -> tuple[
                 before, after = (record_of_resets(p.controller_state) for p in (now, end))
                 which = after.indices[before.number]
                 which = jnp.where(after.number > before.number, which, -1)
-                row.append(which.astype(now.tprev.dtype))
+                begins = now.solver_state.history.after_reset & (before.number > 0)
+                row.append((2 * which + begins.astype(which.dtype)).astype(now.tprev.dtype))
             x = record.packing.pack(of(state))
             return new, record.including(unvmap_max(now.num_steps), jnp.stack(row), x)
 

@@ -85,10 +85,11 @@ class ReverseSweep(eqx.Module):
         # functions may refuse anything that is not a state or a time.
         start, end = (jnp.where(accepted, times[..., i], self.ends.t0) for i in range(2))
         jumped = accepted & (times[..., 2] > 0) if record.jumps else None
-        reset = None
+        reset = begins_at_reset = None
         if record.resets:
-            reset = jnp.where(accepted, times[..., -1], -1).astype(jnp.int32)
-        times = start, end, jumped, reset, accepted
+            code = jnp.where(accepted, times[..., -1], -2).astype(jnp.int32)
+            reset, begins_at_reset = code // 2, code % 2 == 1
+        times = start, end, jumped, reset, begins_at_reset, accepted
         last = max(sizes.kept // sizes.segment - 1, 0)
         kept = lambda: {k: part(x, jnp.minimum(i, last)) for k, x in record.states.items()}
         again = lambda: self._states_again(i, RecordedStep(*times, {}))

@@ -132,8 +132,9 @@ class SavedValues(eqx.Module):
             row = gradient.rows[k]
             t = rows.times[row]
             # A time at the start of a step is saved at the end of the one before, unless a jump is
-            # between.
-            inside = first | (t > step.start) | ((t == step.start) & step.begins_at_jump)
+            # between; none is saved in a step of negative length.
+            inside = first | (t > step.start) | ((t == step.start) & step.begins_anew)
+            inside &= step.end >= step.start
             return step.accepted & (row >= saving.offset) & inside
 
         def through_row(carry):
