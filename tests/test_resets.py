@@ -726,3 +726,27 @@ def test_an_event_at_which_no_step_ends():
     np.testing.assert_allclose(sol.resets.times[:3], [0.7, 1.7, 2.7], atol=1e-5)
     np.testing.assert_allclose(sol.resets.before[:3, 0], 0, atol=1e-5)
     assert sol.stats["num_steps"] < 80
+
+
+def test_real_and_boolean_conditions_that_change_at_one_time():
+    """A step of one unit of rounding lies between them; in it no real condition leaves zero."""
+    thresholds = -1.2, -0.5, 0.0, 0.0, 0.0
+    count = lambda k: lambda t, y, args: y.at[k + 1].add(1)
+    real = [
+        mj.Reset(lambda t, y, args, at=at: y[0] - at, count(k), direction=True)
+        for k, at in enumerate(thresholds)
+    ]
+    boolean = [mj.Reset(lambda t, y, args: y[0] > 0, count(k)) for k in (5, 6)]
+    sol = mj.diffeqsolve(
+        dfx.ODETerm(lambda t, y, args: jnp.zeros(8).at[0].set(1)),
+        dfx.Tsit5(),
+        0.0,
+        10.0,
+        0.1,
+        jnp.zeros(8).at[0].set(-5.3),
+        stepsize_controller=dfx.PIDController(rtol=1e-8, atol=1e-10),
+        resets=(*real, *boolean),
+        max_resets=30,
+    )
+    assert sol.resets.indices[:8].tolist() == [0, 1, 2, 3, 4, 5, 6, -1]
+    assert sol.ys[0, 1:].tolist() == [1] * 7

@@ -17,6 +17,7 @@ class Met(NamedTuple):
 
     numbers: Float[Array, " 7"]
     sides: Float[Array, " resets"]
+    scale: Float[Array, " resets"]
     time: FloatScalar
     before: Y
     after: Y
@@ -29,12 +30,13 @@ class Met(NamedTuple):
         flags = found.happens, found.ends_step, exhausted
         numbers = *flags, found.number, jump.success, found.irregular
         numbers = jnp.stack([found.target, *map(real, numbers)])
-        return Met(numbers, found.sides, jump.time, jump.before, jump.after, jump.memory)
+        of_conditions = found.sides, found.scale
+        return Met(numbers, *of_conditions, jump.time, jump.before, jump.after, jump.memory)
 
     @staticmethod
     def without_event(t: FloatScalar, y: Y, memory: Any, history: History) -> "Met":
         numbers = jnp.asarray([0, 0, 0, 0, 0, 1, 0], t.dtype)
-        return Met(numbers, history.sides, t, y, y, memory)
+        return Met(numbers, history.sides, jnp.zeros_like(history.scale), t, y, y, memory)
 
     @property
     def target(self) -> FloatScalar:

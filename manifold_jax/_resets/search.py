@@ -26,6 +26,9 @@ class History(eqx.Module):
     # The conditions just before the last jump: their values, infinite where only the sign is known, and NaN
     # for the one that caused it, which may have any sign after it.
     sides: Float[Array, " resets"]
+    # Their largest values in the step before the jump, from which follows what is rounding after it. It is
+    # kept as long as a condition has not left zero since, and 0 then.
+    scale: Float[Array, " resets"]
     happened: Int[Array, " resets"]  # how often each has happened
     irregular: IntScalar  # how many had no derivative
     failed: BoolScalar  # whether the state after the last jump could not be used
@@ -33,8 +36,13 @@ class History(eqx.Module):
     @staticmethod
     def initial(count: int, dtype: Any) -> "History":
         never, zero = jnp.zeros(count, jnp.int32), jnp.zeros((), jnp.int32)
-        sides = jnp.zeros(count, dtype)
-        return History(jnp.asarray(True), sides, never, zero, jnp.asarray(False))
+        unknown = jnp.zeros(count, dtype)
+        return History(jnp.asarray(True), unknown, unknown, never, zero, jnp.asarray(False))
+
+    @property
+    def remembers(self) -> Bool[Array, " resets"]:
+        """Which conditions begin the step as the last jump has left them."""
+        return self.after_reset | (self.scale > 0)
 
 
 class Found(NamedTuple):
@@ -47,6 +55,7 @@ class Found(NamedTuple):
     target: FloatScalar  # where a step has to end so that the event is at its end
     time: FloatScalar  # of the event, if it is at the end of this step
     sides: Float[Array, " resets"]  # of the conditions just before the jump, as in [`History`][]
+    scale: Float[Array, " resets"]
 
 
 class EventSearch(NamedTuple):
@@ -71,19 +80,22 @@ class EventSearch(NamedTuple):
         signs = jnp.sign(samples.in_order)
         changes = jnp.any(self._crosses(signs[:-1], signs[1:]))
         is_known = jnp.any(self.known_times <= step.t1 + BEYOND * step.length)
-        return changes | is_known | step.is_negative | history.after_reset
+        return changes | is_known | step.is_negative | jnp.any(history.remembers)
 
     def first(self, step: SearchedStep, samples: SampledConditions, history: History) -> Found:
         """Return the first event of a step."""
         noise, rate = self._sensitivity(step)
         rate = jnp.where(step.is_negative, rate, samples.rate_just_after)
-        before, start, on_surface = self._start(samples, rate, history, noise)
+        small = jnp.maximum(4 * noise, 1e3 * jnp.finfo(noise.dtype).eps * history.scale)
+        before, start, on_surface = self._start(samples, rate, history, small)
         # A jump changed the sign, or the state leaves the surface on which it began: at once.
         leaves = (before != 0) & (start != 0) & self._crosses(before, start)
-        first = jnp.where(jnp.abs(samples.values[1]) > 4 * noise, jnp.sign(samples.values[1]), 0)
+        first = jnp.where(jnp.abs(samples.values[1]) > small, jnp.sign(samples.values[1]), 0)
         rests = on_surface & (start == 0) & self._crosses(-first, first)
         at_once = jnp.where(self.is_known, self.known_times <= step.t0, leaves | rests)
-        signs = jnp.sign(samples.in_order).at[0].set(start)
+        largest = jnp.max(jnp.abs(samples.inside), axis=0)
+        stays = on_surface & (largest <= small)  # in a step so short that its values are rounding
+        signs = jnp.where(stays, start, jnp.sign(samples.in_order).at[0].set(start))
         crossings = self._crosses(signs[:-1], signs[1:])
         place, found = jnp.argmax(crossings, axis=0), jnp.any(crossings, axis=0)
         roots = self._roots(step, samples, place, found & ~at_once, on_surface)
@@ -98,9 +110,12 @@ class EventSearch(NamedTuple):
         # What jumps have caused already, or is at the same time, stays so until its own jump.
         infinite = lambda sign: jnp.where(sign == 0, 0, sign * jnp.inf)
         waiting = jnp.where(leaves, infinite(before), infinite(start))
-        sides = jnp.where(near, infinite(signs[place, jnp.arange(place.size)]), samples.end)
+        sides = jnp.where(stays, infinite(start), samples.end)
+        sides = jnp.where(near, infinite(signs[place, jnp.arange(place.size)]), sides)
         sides = jnp.where(step.is_negative, waiting, sides)
-        return self._chosen(step, roots, near, at_once, irregular, sides)
+        scale = jnp.maximum(largest, history.scale)
+        found = self._chosen(step, roots, near, at_once, irregular, sides)
+        return found._replace(scale=jnp.where(found.ends_step | stays, scale, 0))
 
     def _crosses(self, before: Array, after: Array) -> Array:
         up, down = (before < 0) & (after >= 0), (before > 0) & (after <= 0)
@@ -108,19 +123,19 @@ class EventSearch(NamedTuple):
         return (up & (directions >= 0)) | (down & (directions <= 0))
 
     def _start(
-        self, samples: SampledConditions, rate: Array, history: History, noise: Array
+        self, samples: SampledConditions, rate: Array, history: History, small: Array
     ) -> tuple[Array, ...]:
         """Return the signs just before and just after the start of the step, and which conditions are
         zero there up to rounding; the sign of these is that of their rate of change."""
         largest = jnp.max(jnp.abs(samples.inside), axis=0)
-        is_zero = lambda v: (jnp.abs(v) <= 4 * noise) | (jnp.abs(v) <= 1e-6 * largest)
-        on_surface = history.after_reset & is_zero(samples.values[0])
+        is_zero = lambda v: jnp.abs(v) <= jnp.maximum(small, 1e-6 * largest)
+        on_surface = history.remembers & is_zero(samples.values[0])
         on_surface &= ~self.is_boolean & ~self.is_known
         start = jnp.sign(jnp.where(on_surface, rate, samples.values[0]))
         # One that was zero before the jump as well is taken to have been on the side it can leave.
         touching = jnp.where(on_surface, -self.directions, 0)
         before = jnp.where(is_zero(history.sides), touching, jnp.sign(history.sides))
-        unknown = jnp.isnan(history.sides) | ~history.after_reset
+        unknown = jnp.isnan(history.sides) | ~history.remembers
         return jnp.where(unknown, 0, before), start, on_surface
 
     def _sensitivity(self, step: SearchedStep) -> tuple[Float[Array, " resets"], ...]:
@@ -226,6 +241,7 @@ class EventSearch(NamedTuple):
             target,
             jnp.where(is_told, step.t0, _after(step.t1)),
             sides.at[number].set(jnp.nan),
+            jnp.zeros_like(sides),
         )
 
 

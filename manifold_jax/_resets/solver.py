@@ -87,7 +87,8 @@ class Resetting(dfx.AbstractWrappedSolver):
         jumps = met.ends_step & ~met.exhausted
         happened = history.happened + (once & jumps).astype(jnp.int32)
         irregular = history.irregular + (jumps & met.irregular).astype(jnp.int32)
-        history = History(jumps, met.sides, happened, irregular, jumps & ~met.usable)
+        conditions = met.sides, met.scale
+        history = History(jumps, *conditions, happened, irregular, jumps & ~met.usable)
         result = update_result(result, met.result)
         report = Report(error, met._replace(memory=None, defined=1.0))
         inner = with_memory(inner, met.memory)
