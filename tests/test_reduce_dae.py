@@ -510,8 +510,14 @@ def test_infeasible_starts(reduced):
     dae, args = reduced("pendulum"), models.PENDULUM_ARGS
     with pytest.raises(RuntimeError, match=r"`x\[0\]` fixed"):
         dae.consistent_state(0.0, PENDULUM_GUESS.at[0].set(2.0), args, fixed=("x[0]",))
+    level = PENDULUM_GUESS.at[:2].set(jnp.array([args["L"], 0.0]))
     with pytest.raises(RuntimeError, match=r"fixed: they depend on each other"):
-        dae.consistent_state(0.0, PENDULUM_GUESS, args, fixed=("x[0]", "x[1]"))
+        dae.consistent_state(0.0, level, args, fixed=("x[0]",))  # no direction is left to x[1]
+    held = "x[0]", "x[1]"
+    with pytest.raises(RuntimeError, match=r"No state near .* with `x\[0\]`, `x\[1\]` fixed"):
+        dae.consistent_state(0.0, PENDULUM_GUESS, args, fixed=held)
+    z, _ = dae.consistent_state(0.0, level, args, fixed=held)  # which is where they can be
+    np.testing.assert_allclose(z, [args["L"], 0.0, 0.0, -0.3], atol=1e-15)
     with pytest.raises(ValueError, match=r"`x\[4\]`, not of the state.*follows from it"):
         dae.consistent_state(0.0, PENDULUM_GUESS, args, fixed=("x[4]",))
     with pytest.raises(TypeError, match="a tuple of names"):

@@ -23,7 +23,7 @@ from .._linalg.pivoted import factorize_equilibrated
 from .equations import leaf_names, listed
 from .highest_derivatives import HighestDerivatives
 from .layout import Gather, StateLayout
-from .nearest import Constrained, nearest_state, with_lifted
+from .nearest import Constrained, depends_on_fixed_only, nearest_state, with_lifted
 from .reduced import Reduced
 from .samples import condition, dependent_rows, singular_below
 
@@ -135,14 +135,14 @@ def _find_consistent_state(
     w, finite, implicit = given.w, jnp.all(jnp.isfinite(given.z)), system.analysis.implicit
     guess = jnp.where(finite, given.z, 0)
     free = jnp.asarray(np.where(given.fixed, 0, 1), guess.dtype)
-    nearest = nearest_state(Constrained(system, t, args, free, w), guess)
+    nearest = nearest_state(Constrained(system, t, args, free, w, given.fixed), guess)
     z = with_lifted(system, t, nearest.z, args)
     solvable = jnp.asarray(True)
     if implicit:
         w, solvable = _solve_leading_equations(system.leading_equations(t, z, args), w)
     leading, fixed_w = without_derivative((system.leading_equations(t, z, args), w))
     nonsingular = leading.linearize(fixed_w).usable
-    scaled_residual, full_rank = _check_constraints(system, leading, fixed_w, free)
+    scaled_residual, full_rank = _check_constraints(system, leading, fixed_w, given.fixed)
     near = scaled_residual <= NewtonProjection().tolerance_for(z.dtype)
     success = finite & near & nearest.settled & full_rank & nonsingular & solvable
     correction = jnp.max(jnp.abs(leading.z - guess) / (jnp.abs(guess) + 1), initial=0)
@@ -162,15 +162,18 @@ def _check_constraints(
     system: Reduced,
     leading: HighestDerivatives,
     w: Float[Array, " n"],
-    free: Float[Array, " states"],
+    fixed: tuple[bool, ...],
 ) -> tuple[FloatScalar, BoolScalar]:
     """Return the largest scaled residual of the hidden constraints at a state, and whether their
     gradients with respect to free components are independent."""
     t, z, args, c = leading.t, leading.z, leading.args, system.analysis.c
-    r, G = jacobian(lambda z: system.hidden_constraints(t, z, args, 0, c, w), z)
+    g = lambda z: system.hidden_constraints(t, z, args, 0, c, w)
+    r, G = jacobian(g, z)
     if r.size == 0:  # there may be no state at all
-        return jnp.zeros((), free.dtype), jnp.asarray(True)
-    full_rank = factorize_equilibrated(gram(G, G * free[None, :])).usable
+        return jnp.zeros((), z.dtype), jnp.asarray(True)
+    free = jnp.asarray(np.where(fixed, 0, 1), z.dtype)
+    idle = jnp.diag(depends_on_fixed_only(g, z, free, fixed).astype(z.dtype))
+    full_rank = factorize_equilibrated(gram(G, G * free[None, :]) + idle).usable
     return jnp.max(jnp.abs(r) / row_scale(G, z)), full_rank
 
 

@@ -10,13 +10,14 @@ the voltage of a diode. They do not count for the distance: first the other stat
 equations without lifting, then the lifted ones follow from them.
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from .._base.closure import convert_closure
 from .._base.types import Args, BoolScalar, FloatScalar, IntScalar
@@ -42,10 +43,29 @@ class Constrained(eqx.Module):
     args: Args
     free: Float[Array, " n"]
     w: Float[Array, " k"]  # a guess of the leading derivatives
+    fixed: tuple[bool, ...] = eqx.field(static=True, default=())
 
     def __call__(self, z: Float[Array, " n"]) -> Float[Array, " m"]:
         c = self.system.analysis.unlifted.c
         return self.system.hidden_constraints(self.t, z, self.args, 0, c, self.w)
+
+    def depends_on_fixed_only(self, z: Float[Array, " n"]) -> Bool[Array, " m"]:
+        return depends_on_fixed_only(self, z, self.free, self.fixed)
+
+
+def depends_on_fixed_only(
+    g: Callable, z: Float[Array, " n"], free: Float[Array, " n"], fixed: tuple[bool, ...]
+) -> Bool[Array, " m"]:
+    """Return which equations no free component is in: it has to be seen that they hold, they determine
+    nothing, and their gradients count as independent of all others. To tell them from equations whose
+    gradient is zero by chance, it is looked at in two states."""
+    g, z = without_derivative((g, z))
+    if not any(fixed):
+        return jnp.zeros(jax.eval_shape(g, z).shape, bool)
+    random = jnp.asarray(np.random.default_rng(0).uniform(-0.1, 0.1, z.size), z.dtype)
+    beside = z + random * (1 + jnp.abs(z))
+    gradients = [jacobian(g, at)[1] * free[None, :] for at in (z, beside)]
+    return jnp.all(jnp.stack([jnp.all(G == 0, axis=1) for G in gradients]), axis=0)
 
 
 class _Approach(NamedTuple):
@@ -65,12 +85,13 @@ def _approach(g: Constrained, guess: Float[Array, " n"], m: int) -> _Approach:
     converges up to three radii of curvature away, and needs no second derivatives."""
     g, guess = without_derivative((g, guess))
     rounding = float(jnp.finfo(guess.dtype).eps)
+    idle = jnp.diag(g.depends_on_fixed_only(guess).astype(guess.dtype))
 
     def advance(state: _Approach) -> _Approach:
         offset = guess - state.z
         r, G = jacobian(g, state.z)
         directions = G * g.free[None, :]
-        factored = factorize_equilibrated(gram(G, directions))
+        factored = factorize_equilibrated(gram(G, directions) + idle)
         multipliers = factored.solve(multiply(G, offset))
         along = offset - combine(multipliers, directions)
         step = combine(factored.solve(r), directions)
@@ -107,12 +128,13 @@ def nearest_state(g: Constrained, guess: Float[Array, " n"]) -> NearestState:
         none = jnp.zeros((0,), guess.dtype)
         return NearestState(guess, none, jnp.zeros((), jnp.int32), jnp.asarray(True))
     near = _approach(g, guess, m)
+    idle = g.depends_on_fixed_only(near.z)
 
     def stationarity(x: Float[Array, " k"]) -> Float[Array, " k"]:
         z, multipliers = x[: guess.size], x[guess.size :]
         value, pullback = jax.vjp(g, z)
         (pull,) = pullback(multipliers)
-        return jnp.concatenate([z - guess + g.free * pull, value])
+        return jnp.concatenate([z - guess + g.free * pull, jnp.where(idle, multipliers, value)])
 
     found = jnp.concatenate([near.z, near.multipliers])
     root = implicit_root(SquareSystem(convert_closure(stationarity, found)), found)

@@ -1,14 +1,17 @@
 """The reduced system that users get: a vector field on a manifold."""
 
+from collections.abc import Callable
 from typing import Any
 
 import diffrax as dfx
 import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from .._base.numbers import numbers_as_arrays
 from .._base.types import Args, RealScalarLike, Y
+from .._base.user_functions import check_function
 from .._constraint.projection_info import ProjectionInfo
 from .._rosenbrock import MassMatrixTerm
 from .initial import consistent_state, Guess
@@ -61,7 +64,8 @@ class ReducedDAE(eqx.Module):
         - `derivatives`: guesses for `x', x'', ...`, each like `x_guess`, for states that are derivatives
             without a name of their own; zero if not given.
         - `fixed`: names of fixed unknowns, of whole arrays (`"q"`, of an array alone `"x"`) or
-            numbers (`"q[0]"`), with `'` for derivatives, as in `report.states`.
+            numbers (`"q[0]"`), with `'` for derivatives, as in `report.states`. Equations for fixed
+            unknowns alone have to hold for what is given.
         - `throw`: raise if there is no such state. With `throw=False` look at `info.success`.
 
         **Returns:**
@@ -89,6 +93,57 @@ class ReducedDAE(eqx.Module):
         that are not in the equations are found by differentiating along the solution.
         """
         return _outputs(self.system, t, z, args)
+
+    def jump(
+        self, change: Callable[..., Any], *, fixed: tuple[str, ...] = ()
+    ) -> Callable[[RealScalarLike, Array, Args], Array]:
+        """Return a jump of the state for [`Reset`][] and [`ResetAt`][], written in the unknowns.
+
+        ```python
+        stop = mj.Reset(
+            lambda t, z, args: dae.outputs(t, z, args)[0]["q"][0] - 0.3,
+            dae.jump(lambda t, x, args: {**x, "v": -args["e"] * x["v"]}, fixed=("q",)),
+            direction=True,
+        )
+        ```
+
+        **Arguments:**
+
+        - `change`: `change(t, x, args) -> x`, the unknowns after the jump. For equations of order 2 or 3 it
+            takes and returns derivatives, too: `change(t, x, x', args) -> (x, x')`, up to one below the
+            order.
+        - `fixed`: names of unknowns of the state that are exactly what `change` returns, as in
+            `consistent_state`: what is stored (charges, temperatures), or positions in an impact. The others
+            become those nearest to what it returns that satisfy the equations; multipliers and other algebraic
+            unknowns follow from the state after the jump.
+
+        **Returns:**
+
+        `jump(t, z, args) -> z`. The state is not finite, which ends the solve with a result code, if none
+        near satisfies the equations.
+
+        **Raises:**
+
+        `TypeError` if `change` cannot be called like this. When it is traced, the errors of `consistent_state`,
+        and a `ValueError` if `change` does not return as many values.
+        """
+        order = self.system.equations.order
+        given = ", ".join(["x", "xdot", "xddot"][:order])
+        check_function("change", change, f"change(t, {given}, args)")
+
+        def jump(t: RealScalarLike, z: Array, args: Args = None) -> Array:
+            before = self.outputs(t, z, args)
+            after = change(t, *before[:order], args)
+            after = (after,) if order == 1 else after
+            if not isinstance(after, tuple) or len(after) != order:
+                raise ValueError(f"`change` must return ({given}), a tuple of {order} values.")
+            x, *derivatives = *after, *before[order:]
+            z, info = self.consistent_state(
+                t, x, args, derivatives=tuple(derivatives), fixed=fixed, throw=False
+            )
+            return jnp.where(info.success, z, jnp.nan)
+
+        return jump
 
 
 @numbers_as_arrays("args", times=("t",))
