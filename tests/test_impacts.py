@@ -85,6 +85,31 @@ def test_gradient_through_impacts():
         np.testing.assert_allclose(reverse[i], quotient, rtol=1e-7, atol=1e-7)
 
 
+def test_impacts_without_end():
+    """A pendulum whose bob comes to rest on a floor: the impacts become slower than rounding, and end with
+    the code for too many of them."""
+    system = mj.MechanicalSystem(
+        jnp.ones(2),
+        lambda t, q, args: jnp.stack([jnp.sum(q**2) - 1]),
+        lambda t, q, v, args: jnp.array([0.0, -9.81]),
+    )
+    floor = mj.impact(system, lambda t, q, args: q[1] + 0.6 + 0.3 * q[0], 0.4)
+    sol = mj.diffeqsolve(
+        system.terms,
+        mj.Projected(dfx.Tsit5(), system.constraint),
+        0.0,
+        2.0,
+        None,
+        (jnp.array([1.0, 0.0]), jnp.zeros(2)),
+        stepsize_controller=dfx.PIDController(rtol=1e-10, atol=1e-10),
+        resets=(floor,),
+        max_resets=60,
+        throw=False,
+    )
+    assert sol.result == dfx.RESULTS.max_steps_reached
+    assert sol.resets.number == 60
+
+
 def test_bad_input(as_a_user_meets_it):
     gap = lambda t, q, args: q[0]
     with pytest.raises(ValueError, match="`restitution` must be between 0 and 1"):

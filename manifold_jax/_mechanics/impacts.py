@@ -115,8 +115,11 @@ def _after_impact(
     change = motion.constrained(wanted)
     velocity = motion.unravel(motion.here.w + change)
     after = motion.here.velocity(motion.here.t, motion.here.w + change, (motion.here.x, args))
-    size = jnp.abs(rates[row]) + jnp.finfo(rates.dtype).tiny
-    held = jnp.max(jnp.abs(after - rates - wanted)) <= 1e-6 * size
+    # Impacts without end become slower than rounding.
+    rounding = (
+        1e3 * jnp.finfo(rates.dtype).eps * jnp.max(jnp.abs(motion.C) @ jnp.abs(motion.here.w))
+    )
+    held = jnp.max(jnp.abs(after - rates - wanted)) <= 1e-6 * jnp.abs(rates[row]) + rounding
     possible = held & (e >= 0) & (e <= 1) & motion.mass.valid
     # Added, not selected: the derivative of a discarded NaN would be NaN.
     undefined = jnp.where(possible, 0, jnp.nan)

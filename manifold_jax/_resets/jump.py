@@ -79,7 +79,7 @@ def _time_and_state_of_event(
     flow over such a small time is a step of the midpoint rule: exact for first and second derivatives
     with respect to `d`, as is `d` after two iterations `d - distance / rate` from 0.
     """
-    field = _field(terms, conditions.args)
+    field = vector_field(terms, conditions.args)
     rate = jax.jvp(distance, (end, y), (jnp.ones_like(end), field(end, y)))[1]
     rate = lax.stop_gradient(jnp.where(rate == 0, 1, rate))
     y = conditions.refuse_derivative(end, y)
@@ -110,7 +110,7 @@ def _time_and_state_of_event(
     return end + d, state
 
 
-def _field(terms: Any, args: Any) -> Any:
+def vector_field(terms: Any, args: Any) -> Any:
     """Return the vector field in the time of Diffrax."""
     term = undirected(terms)
     if isinstance(term, MassMatrixTerm):

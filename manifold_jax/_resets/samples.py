@@ -16,17 +16,18 @@ from .._jaxpr.small_products import with_sums
 # Beyond its end a step is searched for this part of its length: the event at which it was meant to end
 # may come a little later.
 BEYOND = 0.01
-_JUST_AFTER = 1e-6  # part of a step in which the direction of a condition is seen at its start
 
 
 class SearchedStep(NamedTuple):
-    """An attempted step in the time of Diffrax, and its dense output at a fraction of the step."""
+    """An attempted step in the time of Diffrax, its dense output at a fraction of the step, and the vector
+    field."""
 
     t0: FloatScalar
     t1: FloatScalar
     y0: Y
     y1: Y
     path: Callable[[FloatScalar], Y]
+    field: Callable[[FloatScalar, Y], Y]
 
     @property
     def length(self) -> FloatScalar:
@@ -38,32 +39,27 @@ class SearchedStep(NamedTuple):
 
 
 class SampledConditions(NamedTuple):
-    """The values of the conditions at fractions of a step: at the ends of equal parts, a little beyond
-    the end, and just after the start."""
+    """The values of the conditions at fractions of a step: at the ends of equal parts, and a little beyond
+    the end."""
 
     fractions: np.ndarray
     values: Float[Array, "samples resets"]
 
     @property
-    def in_order(self) -> Float[Array, "samples resets"]:
-        return self.values[:-1]
-
-    @property
     def inside(self) -> Float[Array, "parts resets"]:
-        return self.values[1:-2]
+        return self.values[1:-1]
 
     @property
-    def end(self) -> Float[Array, " resets"]:
+    def before_end(self) -> Float[Array, " resets"]:
         return self.values[-3]
 
     @property
-    def rate_just_after(self) -> Float[Array, " resets"]:
-        """How conditions begin to change in the step, 0 if they are at rest."""
-        change = self.values[-1] - self.values[0]
-        # At rest it changes with the square of the time.
-        least = 30 * _JUST_AFTER * jnp.abs(self.values[1]) * (len(self.values) - 3)
-        least = jnp.maximum(least, 1e-10 * jnp.max(jnp.abs(self.inside), axis=0)) * _JUST_AFTER
-        return jnp.where(jnp.abs(change) <= least, 0, change)
+    def end(self) -> Float[Array, " resets"]:
+        return self.values[-2]
+
+    @property
+    def beyond(self) -> Float[Array, " resets"]:
+        return self.values[-1]
 
     @staticmethod
     def of(
@@ -72,7 +68,7 @@ class SampledConditions(NamedTuple):
         step: SearchedStep,
     ) -> "SampledConditions":
         inside = np.arange(parts + 1) / parts
-        fractions = np.concatenate([inside, [1 + BEYOND, _JUST_AFTER]])
+        fractions = np.append(inside, 1 + BEYOND)
         where = fractions.astype(step.t0.dtype)
         states = [with_sums(jax.vmap(step.path), part) for part in _split(where, step.y0)]
         states = jtu.tree_map(lambda *parts: jnp.concatenate(parts), *states)

@@ -77,7 +77,7 @@ class EventSearch(NamedTuple):
         self, step: SearchedStep, samples: SampledConditions, history: History
     ) -> BoolScalar:
         """Whether the step needs to be looked at: most steps have no event."""
-        signs = jnp.sign(samples.in_order)
+        signs = jnp.sign(samples.values)
         changes = jnp.any(self._crosses(signs[:-1], signs[1:]))
         is_known = jnp.any(self.known_times <= step.t1 + BEYOND * step.length)
         return changes | is_known | step.is_negative | jnp.any(history.remembers)
@@ -85,7 +85,6 @@ class EventSearch(NamedTuple):
     def first(self, step: SearchedStep, samples: SampledConditions, history: History) -> Found:
         """Return the first event of a step."""
         noise, rate = self._sensitivity(step)
-        rate = jnp.where(step.is_negative, rate, samples.rate_just_after)
         small = jnp.maximum(4 * noise, 1e3 * jnp.finfo(noise.dtype).eps * history.scale)
         before, start, on_surface = self._start(samples, rate, history, small)
         # A jump changed the sign, or the state leaves the surface on which it began: at once.
@@ -95,7 +94,7 @@ class EventSearch(NamedTuple):
         at_once = jnp.where(self.is_known, self.known_times <= step.t0, leaves | rests)
         largest = jnp.max(jnp.abs(samples.inside), axis=0)
         stays = on_surface & (largest <= small)  # in a step so short that its values are rounding
-        signs = jnp.where(stays, start, jnp.sign(samples.in_order).at[0].set(start))
+        signs = jnp.where(stays, start, jnp.sign(samples.values).at[0].set(start))
         crossings = self._crosses(signs[:-1], signs[1:])
         place, found = jnp.argmax(crossings, axis=0), jnp.any(crossings, axis=0)
         roots = self._roots(step, samples, place, found & ~at_once, on_surface)
@@ -140,20 +139,20 @@ class EventSearch(NamedTuple):
 
     def _sensitivity(self, step: SearchedStep) -> tuple[Float[Array, " resets"], ...]:
         """Return how much rounding of time and state may change the conditions at the end of the step, and
-        for a step of negative length, which has no extent, their rates of change, 0 if that may be
-        rounding."""
-        at = step.t1, step.y1
-        fraction = jnp.zeros_like(step.t0)
-        velocity = jax.jvp(step.path, (fraction,), (-jnp.ones_like(fraction),))[1]
-        motion = -step.length, velocity
-        tiny = jtu.tree_map(lambda x: 16 * jnp.finfo(x.dtype).eps * x, at)
+        their rates of change at its start, 0 if that may be rounding. Dense output does not see a hop that is
+        short beside the step."""
+        start, end = (step.t0, step.y0), (step.t1, step.y1)
+        motion = jnp.ones_like(step.t0), step.field(*start)
+        tiny = jtu.tree_map(lambda x: 16 * jnp.finfo(x.dtype).eps * x, end)
         single = jtu.tree_map(lambda x: x[None], motion)
-        parts = _with_signs(tiny), _with_signs(motion), single
-        directions = jtu.tree_map(lambda *x: jnp.concatenate(x), *parts)
-        changes = jax.vmap(lambda along: jax.jvp(self.values, at, along)[1])(directions)
+        parts = _with_signs(tiny), _with_signs(jtu.tree_map(_uncertainty, motion)), single
+        along = jtu.tree_map(lambda *x: jnp.concatenate(x), *parts)
+        n = _PERTURBATIONS
+        at = jtu.tree_map(lambda a, b: jnp.stack([a] * n + [b] * (n + 1)), end, start)
+        changes = jax.vmap(lambda at, along: jax.jvp(self.values, at, along)[1])(at, along)
         largest = lambda x: jnp.max(jnp.abs(x), axis=0)
-        n, rate = _PERTURBATIONS, changes[-1]
-        rate = jnp.where(jnp.abs(rate) <= 1e-10 * largest(changes[n : 2 * n]), 0, rate)
+        rate = changes[-1]
+        rate = jnp.where(jnp.abs(rate) <= largest(changes[n : 2 * n]), 0, rate)
         return jnp.where(self.is_boolean, 0, largest(changes[:n])), rate
 
     def _roots(
@@ -190,7 +189,7 @@ class EventSearch(NamedTuple):
         rounding: Any,
     ) -> Bool[Array, " resets"]:
         """Return which roots are the end of the step, up to rounding."""
-        rate = jnp.abs(samples.end - samples.values[-4]) * self.parts  # per step
+        rate = jnp.abs(samples.end - samples.before_end) * self.parts  # per step
         noise = noise / jnp.maximum(rate, 1e3 * noise + jnp.finfo(rate.dtype).tiny)
         noise = jnp.where(self.is_boolean, 1e-12, noise)
         tolerance = 16 * rounding + jnp.abs(step.length) * noise
@@ -201,7 +200,7 @@ class EventSearch(NamedTuple):
         """Return which events have no derivative: more than one at a time, or zeros with almost no slope."""
         # That at the end of the parabola through three samples.
         a, b, end = BEYOND, 1 / self.parts, samples.end
-        right, left = (samples.values[-2] - end) / a, (end - samples.values[-4]) / b
+        right, left = (samples.beyond - end) / a, (end - samples.before_end) / b
         grazes = jnp.abs((right * b + left * a) / (a + b)) <= 1e-3 * jnp.max(
             jnp.abs(samples.inside), axis=0
         )
@@ -233,16 +232,24 @@ class EventSearch(NamedTuple):
         told = EventAtStart.told_by(step.t0, step.t1, roots.size)
         is_told = told.happens
         number = jnp.where(is_told, told.number, number)
+        ends_step = is_at_end | is_told
+        unknown = jnp.where(ends_step, jnp.nan, sides)
         return Found(
             happens | is_told,
-            is_at_end | is_told,
+            ends_step,
             jnp.where(is_told, told.irregular, irregular[number]),
             number,
             target,
             jnp.where(is_told, step.t0, _after(step.t1)),
-            sides.at[number].set(jnp.nan),
+            jnp.where(jnp.arange(sides.size, dtype=number.dtype) == number, unknown, sides),
             jnp.zeros_like(sides),
         )
+
+
+def _uncertainty(velocity: Array) -> Array:
+    """Return how large velocities are that may be rounding, also of others that a jump has taken away."""
+    size = jnp.abs(velocity)
+    return 1e-10 * size + 64 * jnp.finfo(velocity.dtype).eps * jnp.max(size, initial=0)
 
 
 def _with_signs(tree: Any) -> Any:

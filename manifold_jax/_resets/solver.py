@@ -18,7 +18,7 @@ from .._linalg.newton import without_derivative
 from .._solver.base import AbstractManifoldSolver
 from .._solver.step.hook_state import memory_of, with_memory
 from .conditions import Conditions
-from .jump import Jump, jump_at_end
+from .jump import Jump, jump_at_end, vector_field
 from .met import Met, Report
 from .samples import SampledConditions, SearchedStep
 from .search import EventSearch, Found, History
@@ -176,7 +176,8 @@ class Resetting(dfx.AbstractWrappedSolver):
             history.happened >= self.conditions.most,
             self.conditions.next_times(self.t0, history.happened, direction),
         )
-        return search, SearchedStep(t0, t1, y0, y1, path.evaluate), history
+        field = vector_field(terms, self.conditions.args)
+        return search, SearchedStep(t0, t1, y0, y1, path.evaluate, field), history
 
     @property
     def interpolation_cls(self):  # pyright: ignore
