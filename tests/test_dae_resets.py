@@ -166,7 +166,9 @@ def test_what_a_jump_keeps_and_what_it_cannot_do():
         TypeError, match=r"`change` must be a callable `change\(t, x, xdot, args\)`"
     ):
         dae.jump(lambda t, x, args: x)
-    with pytest.raises(ValueError, match=r"`change` must return \(x, xdot\), a tuple of 2 values"):
+    with pytest.raises(ValueError, match=r"`change` must return \(x, xdot\), of the structure"):
         dae.jump(lambda t, x, xdot, args: x)(0.0, z0, args)
+    with pytest.raises(ValueError, match=r"`change` must return \(x, xdot\), of the structure"):
+        dae.jump(lambda t, x, xdot, args: ({**x, "q": x["q"][:1]}, xdot))(0.0, z0, args)
     with pytest.raises(ValueError, match="`fixed` names `tension`"):
         dae.jump(lambda t, x, xdot, args: (x, xdot), fixed=("tension",))(0.0, z0, args)

@@ -417,6 +417,11 @@ def test_zeno():
         assert sol.result == dfx.RESULTS.max_steps_reached
         assert sol.resets.number == 200
         assert jnp.min(sol.resets.before[:, 0]) > -1e-10
+    random = np.random.default_rng(0)
+    for p in jnp.asarray(random.uniform([5, 0.2, 0.5, -3], [15, 0.8, 6, 3], (20, 4))):
+        sol = drop(p, 12.0, throw=False, max_resets=400)
+        assert sol.resets.number == 400
+        assert jnp.min(sol.resets.before[:, 0]) > -1e-10
     with pytest.raises(Exception, match="more events than `max_resets`"):
         drop(BALL, 12.0)
 

@@ -23,7 +23,7 @@ from .._linalg.pivoted import factorize_equilibrated
 from .equations import leaf_names, listed
 from .highest_derivatives import HighestDerivatives
 from .layout import Gather, StateLayout
-from .nearest import Constrained, depends_on_fixed_only, nearest_state, with_lifted
+from .nearest import Constrained, depends_on_fixed_only, free_components, nearest_state, with_lifted
 from .reduced import Reduced
 from .samples import condition, dependent_rows, singular_below
 
@@ -134,8 +134,7 @@ def _find_consistent_state(
     was done, and whether the matrix of the leading derivatives is nonsingular there."""
     w, finite, implicit = given.w, jnp.all(jnp.isfinite(given.z)), system.analysis.implicit
     guess = jnp.where(finite, given.z, 0)
-    free = jnp.asarray(np.where(given.fixed, 0, 1), guess.dtype)
-    nearest = nearest_state(Constrained(system, t, args, free, w, given.fixed), guess)
+    nearest = nearest_state(Constrained(system, t, args, w, given.fixed), guess)
     z = with_lifted(system, t, nearest.z, args)
     solvable = jnp.asarray(True)
     if implicit:
@@ -171,8 +170,8 @@ def _check_constraints(
     r, G = jacobian(g, z)
     if r.size == 0:  # there may be no state at all
         return jnp.zeros((), z.dtype), jnp.asarray(True)
-    free = jnp.asarray(np.where(fixed, 0, 1), z.dtype)
-    idle = jnp.diag(depends_on_fixed_only(g, z, free, fixed).astype(z.dtype))
+    free = free_components(fixed, z)
+    idle = jnp.diag(depends_on_fixed_only(g, z, fixed).astype(z.dtype))
     full_rank = factorize_equilibrated(gram(G, G * free[None, :]) + idle).usable
     return jnp.max(jnp.abs(r) / row_scale(G, z)), full_rank
 

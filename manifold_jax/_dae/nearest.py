@@ -35,26 +35,27 @@ _MAX_STEPS = 300
 
 
 class Constrained(eqx.Module):
-    """The constraints `g(z) = 0` without the equations of lifted unknowns, and the diagonal `free` of
-    `W^-1`, 0 for components that are fixed."""
+    """The constraints `g(z) = 0` without the equations of lifted unknowns, and which components are
+    fixed."""
 
     system: Reduced
     t: Array
     args: Args
-    free: Float[Array, " n"]
     w: Float[Array, " k"]  # a guess of the leading derivatives
-    fixed: tuple[bool, ...] = eqx.field(static=True, default=())
+    fixed: tuple[bool, ...] = eqx.field(static=True)
 
     def __call__(self, z: Float[Array, " n"]) -> Float[Array, " m"]:
         c = self.system.analysis.unlifted.c
         return self.system.hidden_constraints(self.t, z, self.args, 0, c, self.w)
 
-    def depends_on_fixed_only(self, z: Float[Array, " n"]) -> Bool[Array, " m"]:
-        return depends_on_fixed_only(self, z, self.free, self.fixed)
+
+def free_components(fixed: tuple[bool, ...], z: Float[Array, " n"]) -> Float[Array, " n"]:
+    """Return 0 for components that are fixed and 1 for the others."""
+    return jnp.asarray(np.where(fixed, 0, 1), z.dtype)
 
 
 def depends_on_fixed_only(
-    g: Callable, z: Float[Array, " n"], free: Float[Array, " n"], fixed: tuple[bool, ...]
+    g: Callable, z: Float[Array, " n"], fixed: tuple[bool, ...]
 ) -> Bool[Array, " m"]:
     """Return which equations no free component is in: it has to be seen that they hold, they determine
     nothing, and their gradients count as independent of all others. To tell them from equations whose
@@ -64,6 +65,7 @@ def depends_on_fixed_only(
         return jnp.zeros(jax.eval_shape(g, z).shape, bool)
     random = jnp.asarray(np.random.default_rng(0).uniform(-0.1, 0.1, z.size), z.dtype)
     beside = z + random * (1 + jnp.abs(z))
+    free = free_components(fixed, z)
     gradients = [jacobian(g, at)[1] * free[None, :] for at in (z, beside)]
     return jnp.all(jnp.stack([jnp.all(G == 0, axis=1) for G in gradients]), axis=0)
 
@@ -85,12 +87,13 @@ def _approach(g: Constrained, guess: Float[Array, " n"], m: int) -> _Approach:
     converges up to three radii of curvature away, and needs no second derivatives."""
     g, guess = without_derivative((g, guess))
     rounding = float(jnp.finfo(guess.dtype).eps)
-    idle = jnp.diag(g.depends_on_fixed_only(guess).astype(guess.dtype))
+    idle = jnp.diag(depends_on_fixed_only(g, guess, g.fixed).astype(guess.dtype))
+    free = free_components(g.fixed, guess)
 
     def advance(state: _Approach) -> _Approach:
         offset = guess - state.z
         r, G = jacobian(g, state.z)
-        directions = G * g.free[None, :]
+        directions = G * free[None, :]
         factored = factorize_equilibrated(gram(G, directions) + idle)
         multipliers = factored.solve(multiply(G, offset))
         along = offset - combine(multipliers, directions)
@@ -128,13 +131,14 @@ def nearest_state(g: Constrained, guess: Float[Array, " n"]) -> NearestState:
         none = jnp.zeros((0,), guess.dtype)
         return NearestState(guess, none, jnp.zeros((), jnp.int32), jnp.asarray(True))
     near = _approach(g, guess, m)
-    idle = g.depends_on_fixed_only(near.z)
+    idle = depends_on_fixed_only(g, near.z, g.fixed)
+    free = free_components(g.fixed, guess)
 
     def stationarity(x: Float[Array, " k"]) -> Float[Array, " k"]:
         z, multipliers = x[: guess.size], x[guess.size :]
         value, pullback = jax.vjp(g, z)
         (pull,) = pullback(multipliers)
-        return jnp.concatenate([z - guess + g.free * pull, jnp.where(idle, multipliers, value)])
+        return jnp.concatenate([z - guess + free * pull, jnp.where(idle, multipliers, value)])
 
     found = jnp.concatenate([near.z, near.multipliers])
     root = implicit_root(SquareSystem(convert_closure(stationarity, found)), found)

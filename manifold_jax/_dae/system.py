@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._base.numbers import numbers_as_arrays
+from .._base.shapes import are_alike, shapes
 from .._base.types import Args, RealScalarLike, Y
 from .._base.user_functions import check_function
 from .._constraint.projection_info import ProjectionInfo
@@ -135,8 +136,11 @@ class ReducedDAE(eqx.Module):
             before = self.outputs(t, z, args)
             after = change(t, *before[:order], args)
             after = (after,) if order == 1 else after
-            if not isinstance(after, tuple) or len(after) != order:
-                raise ValueError(f"`change` must return ({given}), a tuple of {order} values.")
+            if not are_alike(after, before[:order]):
+                raise ValueError(
+                    f"`change` must return ({given}), of the structure and shapes {shapes(before[:order])}, got "
+                    f"{shapes(after)}."
+                )
             x, *derivatives = *after, *before[order:]
             z, info = self.consistent_state(
                 t, x, args, derivatives=tuple(derivatives), fixed=fixed, throw=False

@@ -89,7 +89,7 @@ class EventSearch(NamedTuple):
         before, start, on_surface = self._start(samples, rate, history, small)
         # A jump changed the sign, or the state leaves the surface on which it began: at once.
         leaves = (before != 0) & (start != 0) & self._crosses(before, start)
-        first = jnp.where(jnp.abs(samples.values[1]) > small, jnp.sign(samples.values[1]), 0)
+        first = _first_sign(samples.inside, small)
         rests = on_surface & (start == 0) & self._crosses(-first, first)
         at_once = jnp.where(self.is_known, self.known_times <= step.t0, leaves | rests)
         largest = jnp.max(jnp.abs(samples.inside), axis=0)
@@ -112,7 +112,11 @@ class EventSearch(NamedTuple):
         sides = jnp.where(stays, infinite(start), samples.end)
         sides = jnp.where(near, infinite(signs[place, jnp.arange(place.size)]), sides)
         sides = jnp.where(step.is_negative, waiting, sides)
-        scale = jnp.maximum(largest, history.scale)
+        # What a condition is at its event is zero, whatever is left of it there.
+        left_over = jnp.abs(samples.end) / (500 * jnp.finfo(noise.dtype).eps)
+        largest = jnp.where(near, jnp.maximum(largest, left_over), largest)
+        kept = jnp.where(step.is_negative | stays, history.scale, 0)
+        scale = jnp.maximum(largest, kept)
         found = self._chosen(step, roots, near, at_once, irregular, sides)
         return found._replace(scale=jnp.where(found.ends_step | stays, scale, 0))
 
@@ -244,6 +248,12 @@ class EventSearch(NamedTuple):
             jnp.where(jnp.arange(sides.size, dtype=number.dtype) == number, unknown, sides),
             jnp.zeros_like(sides),
         )
+
+
+def _first_sign(values: Float[Array, "samples resets"], small: Array) -> Float[Array, " resets"]:
+    """Return the sign of the first value of each condition that is larger than rounding, 0 without one."""
+    signs = jnp.where(jnp.abs(values) > small[None, :], jnp.sign(values), 0)
+    return signs[jnp.argmax(signs != 0, axis=0), jnp.arange(values.shape[1])]
 
 
 def _uncertainty(velocity: Array) -> Array:
