@@ -1,5 +1,8 @@
 """Drawings of mechanisms: where the constraint holds, bodies meet and have their lengths."""
 
+from types import SimpleNamespace
+
+import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 import pytest
@@ -7,14 +10,15 @@ from PIL import Image
 from typer.testing import CliRunner
 
 import manifold_jax as mj
-from manifold_jax._tools.animate import SKETCHES
+from manifold_jax._tools.animate import DrawnMotion, SKETCHES
 from manifold_jax._tools.cli import app
 
 
 def lines_of(name, moved=0.0):
-    problem = mj.problems.ALL[name]()
-    q = np.asarray(problem.y0[0])[None] + moved
-    return [line[0] for line in SKETCHES[name](q, problem.args)], problem.args
+    problem = (mj.problems.ALL | mj.problems.FURTHER)[name]()
+    q = jtu.tree_map(lambda x: np.asarray(x)[None] + moved, problem.y0[0])
+    motion = DrawnMotion(np.zeros(1), q, problem.args)
+    return [line[0] for line in SKETCHES[name](motion)], problem.args
 
 
 def lengths(line):
@@ -48,7 +52,36 @@ def test_slider_crank_and_parallelogram_are_closed_where_the_constraint_holds():
     np.testing.assert_allclose(coupler, [crank[-1] for crank in cranks], atol=1e-12)
 
 
-def test_all_planar_mechanisms_have_a_drawing_and_others_are_refused():
+def test_robots_are_closed_where_the_constraint_holds():
+    lines, _ = lines_of("stewart-platform")
+    base, platform, *legs = lines
+    np.testing.assert_allclose([leg[0] for leg in legs[0::2]], base[:6], atol=1e-12)
+    np.testing.assert_allclose([leg[0] for leg in legs[1::2]], platform[:6], atol=1e-12)
+    lines, _ = lines_of("delta-robot")
+    for arm, elbows, *rods in (lines[i : i + 4] for i in range(0, 12, 4)):
+        np.testing.assert_allclose(arm[1], elbows.mean(axis=0), atol=1e-12)
+        assert all(np.min(np.linalg.norm(lines[12] - rod[1], axis=1)) < 1e-12 for rod in rods)
+        # Parallel rods of the same length are so in every view.
+        np.testing.assert_allclose(*[rod[1] - rod[0] for rod in rods], atol=1e-12)
+
+
+def test_the_hip_of_a_walker_does_not_jump():
+    problem = mj.problems.compass_gait()
+    before = problem.reference(3.88)
+    after = problem.resets[0].jump(3.88, jtu.tree_map(jnp.asarray, before), problem.args)
+    resets = SimpleNamespace(
+        number=1,
+        times=np.array([3.88, np.inf]),
+        before=[np.stack([before[0]] * 2)],
+        after=[np.stack([after[0]] * 2)],
+    )
+    times, q = np.array([3.87, 3.88]), np.stack([before[0], after[0]])
+    _, stance, swing = SKETCHES["compass-gait"](DrawnMotion(times, q, problem.args, resets))
+    np.testing.assert_allclose(stance[0], swing[1], atol=1e-12)
+    np.testing.assert_allclose(swing[0], stance[1], atol=1e-12)
+
+
+def test_all_mechanisms_have_a_drawing_and_others_are_refused():
     for name in SKETCHES:
         assert jtu.tree_leaves(lines_of(name)[0])
     outcome = CliRunner().invoke(app, ["animate", "kepler", "--out", "film.gif"])

@@ -88,7 +88,7 @@ def test_the_certificate_says_what_it_does_not_cover():
     *_, left_out, note = certificate_scope(
         [dataclasses.replace(one, checks=checks)], [], [BAUMGARTE]
     )
-    assert left_out == "Left out: baumgarte, which needs a mechanical system."
+    assert left_out == "Left out: baumgarte, which needs a mechanical system without jumps."
     assert note == "Not covered: solvers other than Tsit5; other tolerances."
 
 
@@ -130,7 +130,10 @@ def test_adjoints_are_compared_with_steps_that_are_chosen_anew():
     [
         (("pendulums",), "there is no problem 'pendulums'"),
         (("pendulum", "--methods", "best"), "there is no method 'best'"),
-        (("kepler", "--methods", "baumgarte"), "needs a mechanical system, which `kepler` has not"),
+        (
+            ("kepler", "--methods", "baumgarte"),
+            "needs a mechanical system without jumps, which `kepler` has not",
+        ),
         (("pendulum", "--adjoints", "none"), "there is no adjoint 'none'. Choose one of: forward"),
         (("pendulum", "--solvers", "rk4"), "there is no solver 'rk4'. Choose one of: heun"),
         (("pendulum", "--tolerance", "0"), "--tolerance: must be a positive number, got 0.0"),

@@ -60,8 +60,9 @@ def test_list_has_every_problem():
     result = run("list")
     assert result.exit_code == 0
     lines = [line.split() for line in result.stdout.splitlines() if line.strip()]
-    sizes = {line[0]: line[1:3] for line in lines if line[0] in problems.ALL}
-    assert list(sizes) == list(problems.ALL)
+    gallery = problems.ALL | problems.FURTHER
+    sizes = {line[0]: line[1:3] for line in lines if line[0] in gallery}
+    assert list(sizes) == list(gallery)
     assert sizes["pendulum"] == ["4", "2"]
     assert sizes["sphere-flow"] == ["10", "1"]
     assert sizes["rotation"] == ["9", "6"]
@@ -71,7 +72,7 @@ def test_list_has_every_problem():
 
 
 def test_summaries_are_one_line_without_mathematics():
-    for build in problems.ALL.values():
+    for build in (problems.ALL | problems.FURTHER).values():
         summary = report.summary(build)
         assert 10 < len(summary) < 100
         assert not set("$\\\n") & set(summary)
@@ -106,7 +107,7 @@ def test_compare_writes_the_table_as_json(comparison):
     assert settings["output_points"] == 1001
     assert settings["failures"] == {}
     assert settings["left_out"] == {
-        "baumgarte tsit5": "needs a mechanical system",
+        "baumgarte tsit5": "needs a mechanical system without jumps",
         "lie-group tsit5": "needs a chart of its own",
     }
     approaches = ["plain", "projected", "one-step", "invariant", "exact", "tangent", "partition"]
@@ -154,7 +155,7 @@ def test_compare_prints_what_it_writes(comparison):
         assert cells[5] == f"{row['error']:.1e}"
     assert "Step limit chosen for Diffrax: 4096" in result.stdout
     assert "(invariant, exact) with gain 1 per unit of time" in result.stdout
-    assert "Left out: baumgarte, which needs a mechanical system" in result.stdout
+    assert "Left out: baumgarte, which needs a mechanical system without jumps" in result.stdout
 
 
 def test_compare_draws_a_picture(comparison):
@@ -400,7 +401,10 @@ def test_an_approach_for_some_problems(tmp_path):
             ("pendulum", "--methods", ""),
             "partition, lie-group, scipy-rk45, scipy-dop853, scipy-lsoda",
         ),
-        (("kepler", "--methods", "baumgarte"), "mechanical system, which `kepler` has not"),
+        (
+            ("kepler", "--methods", "baumgarte"),
+            "mechanical system without jumps, which `kepler` has not",
+        ),
         (("pendulum", "--t1", "0"), "must be later than the start of `pendulum`, t0 = 0"),
         (("arevalo", "--t1", "0.5"), "t0 = 1; got 0.5"),
         (("pendulum", "--plot", "picture.gif"), "must end in one of: .png"),

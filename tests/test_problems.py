@@ -162,7 +162,7 @@ def integrate(problem, tolerance=3e-14):
 
 
 def test_names():
-    for name, build in problems.ALL.items():
+    for name, build in (problems.ALL | problems.FURTHER).items():
         assert build.__name__ == name.replace("-", "_")
         assert getattr(problems, build.__name__) is build
         assert build().name == name

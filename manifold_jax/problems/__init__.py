@@ -1,9 +1,8 @@
 """The problem gallery: vector fields on manifolds whose solutions are known.
 
 Every function builds a [`Problem`][]; its docstring has the equations, the source of every number and
-the digits to trust. `ALL` has those that take seconds to compile: not the delta robot and the Stewart
-platform, nor those that are there to be large (`polymer`, `cable_net`, `falling_truss`, `n_four_bar`) or
-that have jumps (`compass_gait`).
+the digits to trust. `ALL` has those that take seconds to compile, `FURTHER` the others: robots, those
+that are there to be large, and those that have jumps.
 """
 
 from collections.abc import Callable
@@ -32,11 +31,15 @@ from .small_daes import arevalo as arevalo, jay2 as jay2, skate as skate
 from .stewart_platform import stewart_platform as stewart_platform
 
 
-ALL: dict[str, Callable[[], Problem]] = {
-    build.__name__.replace("_", "-"): build
-    for build in (
-        harmonic_oscillator, pendulum, rigid_body, kepler, lotka_volterra, car_axis, jay2, arevalo,
-        skate, sphere_flow, rotation, double_pendulum, chain, slider_crank, four_bar, parallelogram,
-        spherical_pendulum, heavy_top, rolling_disc,
-    )
-}  # fmt: skip
+def _named(*builds: Callable[[], Problem]) -> dict[str, Callable[[], Problem]]:
+    return {build.__name__.replace("_", "-"): build for build in builds}
+
+
+ALL = _named(
+    harmonic_oscillator, pendulum, rigid_body, kepler, lotka_volterra, car_axis, jay2, arevalo, skate,
+    sphere_flow, rotation, double_pendulum, chain, slider_crank, four_bar, parallelogram,
+    spherical_pendulum, heavy_top, rolling_disc,
+)  # fmt: skip
+FURTHER = _named(
+    compass_gait, delta_robot, stewart_platform, n_four_bar, cable_net, falling_truss, polymer,
+)  # fmt: skip

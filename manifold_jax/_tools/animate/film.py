@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import diffrax as dfx
 import jax
 import jax.numpy as jnp
+import jax.tree_util as jtu
 import matplotlib
 import numpy as np
 from matplotlib.animation import FuncAnimation, PillowWriter
@@ -16,6 +17,7 @@ from matplotlib.figure import Figure
 from ..compare.approaches import Approach, APPROACHES
 from ..compare.task import as_rows, Task
 from ..compare.with_diffrax import LAST_MAX_STEPS, solve_task, SOLVERS
+from .motion import DrawnMotion
 from .sketches import SKETCHES
 
 
@@ -35,10 +37,11 @@ class Take(NamedTuple):
 def write_film(path: Path, task: Task, seconds: float) -> list[Take]:
     """Write the last `seconds` of the task, in real time, as a GIF."""
     times = task.t1 - seconds + np.arange(round(seconds * _RATE)) / _RATE
-    takes = [_take(task, one, times) for one in APPROACHES if one.name in _SHOWN]
+    shown = [one for one in APPROACHES if one.name in _SHOWN]
+    takes = [_take(task, one, times) for one in shown if _applies(one, task)]
     matplotlib.use("Agg")
     figure = Figure(figsize=(7.2, 4.0), dpi=_DPI, layout="constrained")
-    axes = figure.subplots(1, 2, sharex=True, sharey=True)
+    axes = figure.subplots(1, len(takes), sharex=True, sharey=True, squeeze=False)[0]
     artists = [_draw(ax, take) for ax, take in zip(axes, takes, strict=True)]
     _set_limits(axes[0], takes)
     title = figure.suptitle(task.problem.name)
@@ -63,11 +66,17 @@ def _take(task: Task, approach: Approach, times: np.ndarray) -> Take:
     solve = approach.formulate(problem, SOLVERS[task.solver](), task.gain)
 
     def states(y0, args, ts):
-        return solve_task(task, solve, y0, args, dfx.SaveAt(ts=ts), LAST_MAX_STEPS).ys
+        sol = solve_task(task, solve, y0, args, dfx.SaveAt(ts=ts), LAST_MAX_STEPS)
+        return sol.ys, getattr(sol, "resets", None)
 
-    ys = jax.jit(states)(problem.y0, problem.args, jnp.asarray(times))
-    lines = SKETCHES[problem.name](np.asarray(ys[0]), problem.args)
+    ys, resets = jax.jit(states)(problem.y0, problem.args, jnp.asarray(times))
+    motion = DrawnMotion(times, jtu.tree_map(np.asarray, ys[0]), problem.args, resets)
+    lines = SKETCHES[problem.name](motion)
     return Take(approach.name, lines, task.violations(times, as_rows(ys)))
+
+
+def _applies(approach: Approach, task: Task) -> bool:
+    return approach.needs is None or approach.needs.is_met_by(task.problem)
 
 
 def _draw(ax: Axes, take: Take) -> tuple[list[Any], Any]:

@@ -1,5 +1,6 @@
 """`manifold-jax animate`: drift made visible."""
 
+import dataclasses
 from pathlib import Path
 from typing import Annotated
 
@@ -17,23 +18,34 @@ def animate(
         str,
         typer.Argument(
             metavar="PROBLEM",
-            help="A planar mechanism: pendulum, double-pendulum, chain, slider-crank, four-bar, "
-            "parallelogram.",
+            help="A mechanism of the gallery: pendulum, double-pendulum, chain, slider-crank, "
+            "four-bar, n-four-bar, parallelogram, falling-truss, compass-gait, spherical-pendulum, "
+            "polymer, cable-net, delta-robot, stewart-platform.",
         ),
     ],
     out: Annotated[Path, typer.Option(metavar="FILE", help="The picture to write (gif).")],
     solver: options.SolverName = "tsit5",
     rtol: options.RelativeTolerance = 1e-4,
     atol: options.AbsoluteTolerance = 1e-4,
-    t1: Annotated[float, typer.Option(metavar="T", help="End of the time span.")] = 60.0,
-    seconds: Annotated[
-        float,
+    t1: Annotated[
+        float | None,
         typer.Option(
-            help="Length of the part at its end that is shown, in the time of the problem."
+            metavar="T",
+            help="End of the time span, by default a minute, or that of the problem if it is large or "
+            "has jumps.",
         ),
-    ] = 5.0,
+    ] = None,
+    seconds: Annotated[
+        float | None,
+        typer.Option(
+            metavar="T",
+            help="Length of the part at its end that is shown, in the time of the problem, by default "
+            "5 or all.",
+        ),
+    ] = None,
 ) -> None:
-    """Draw a planar mechanism in motion, without and with projection side by side.
+    """Draw a mechanism in motion, without and with projection side by side; one with jumps with projection
+    only.
 
     Both are solved from the start to the end of the time span with the same solver and tolerance;
     the last seconds are shown. Bodies are drawn from their own coordinates: where the joints do not
@@ -42,16 +54,22 @@ def animate(
 
     Takes half a minute on one core, most of it to compile.
     """
-    check_positive(seconds, "--seconds")
+    from ...problems import ALL
+
     task = task_for(problem, solver, rtol, atol, t1, None)
+    if t1 is None and task.problem.name in ALL:
+        task = dataclasses.replace(task, t1=task.t0 + 60.0)
+    span = task.t1 - task.t0
+    seconds = min(5.0, span) if seconds is None else seconds
+    check_positive(seconds, "--seconds")
     check_target(out, "--out", (".gif",))
     check_can_draw(out, "--out")
     from ..animate import SKETCHES, write_film
 
     check_name(task.problem.name, SKETCHES, "drawing of the problem", "PROBLEM")
-    if not seconds <= task.t1 - task.t0:
+    if not seconds <= span:
         raise typer.BadParameter(
-            f"must be at most the time span, {task.t1 - task.t0:g}; got {seconds:g}.",
+            f"must be at most the time span, {span:g}; got {seconds:g}.",
             param_hint="--seconds",
         )
     with progress_bar() as progress:

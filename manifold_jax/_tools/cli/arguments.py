@@ -28,15 +28,16 @@ def task_for(
     problem: str, solver: str, rtol: float, atol: float, t1: float | None, gain: float | None
 ) -> "Task":
     """Return the task for the arguments, or raise an error that lists the valid ones."""
-    from ...problems import ALL
+    from ...problems import ALL, FURTHER
     from ..compare.approaches import default_gain
     from ..compare.task import Task
     from ..compare.with_diffrax import SOLVERS
 
     problem, solver = problem.lower().replace("_", "-"), solver.lower()
-    check_name(problem, ALL, "problem", "PROBLEM")
+    gallery = ALL | FURTHER
+    check_name(problem, gallery, "problem", "PROBLEM")
     check_name(solver, SOLVERS, "solver", "--solver")
-    built = ALL[problem]()
+    built = gallery[problem]()
     gain = default_gain(built) if gain is None else gain
     for name, value in (("--rtol", rtol), ("--atol", atol), ("--gain", gain)):
         check_positive(value, name)

@@ -83,6 +83,7 @@ def ensemble(
             saveat=dfx.SaveAt(t1=True, fn=varied.saved),
             stepsize_controller=dfx.PIDController(rtol=rtol, atol=atol),
             max_steps=2**20,
+            resets=task.problem.resets,
             lanes=lanes,
             chunk=chunk,
             seed=seed,

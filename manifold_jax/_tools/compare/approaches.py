@@ -18,15 +18,18 @@ from ...problems import Problem
 
 
 class Formulation(NamedTuple):
-    """A problem as it is integrated: the function that solves, and its first two arguments."""
+    """A problem as it is integrated: the function that solves, its first two arguments, and the jumps."""
 
     function: Callable[..., dfx.Solution]
     terms: dfx.AbstractTerm
     solver: dfx.AbstractSolver
+    resets: tuple = ()
 
     def solve(self, t0: Any, t1: Any, y0: Any, args: Any, **options: Any) -> dfx.Solution:
         """Return the solution, with further options of `diffrax.diffeqsolve`; its `result` says whether
         the solve failed."""
+        if self.resets:
+            options |= {"resets": self.resets}
         return self.function(
             self.terms, self.solver, t0, t1, None, y0, args, throw=False, **options
         )
@@ -36,20 +39,21 @@ Formulate = Callable[[Problem, dfx.AbstractSolver, float], Formulation]
 
 
 class Need(NamedTuple):
-    """A requirement that not every problem meets: the attribute that is None then, and its name."""
+    """A requirement that not every problem meets, and its name."""
 
-    attribute: str
+    is_met_by: Callable[[Problem], bool]
     phrase: str
-
-    def is_met_by(self, problem: Problem) -> bool:
-        return getattr(problem, self.attribute) is not None
 
     def __str__(self) -> str:
         return f"needs {self.phrase}"
 
 
-SYSTEM = Need("system", "a mechanical system")
-CHART = Need("chart", "a chart of its own")
+SYSTEM = Need(
+    lambda problem: problem.system is not None and not problem.resets,
+    "a mechanical system without jumps",
+)
+CHART = Need(lambda problem: problem.chart is not None, "a chart of its own")
+CONTINUOUS = Need(lambda problem: not problem.resets, "a solution without jumps")
 
 
 class Style(NamedTuple):
@@ -101,7 +105,7 @@ def _within(
 
     def formulate(problem: Problem, solver: dfx.AbstractSolver, gain: float) -> Formulation:
         wrapped = hook(solver, problem.constraint, **options(problem, gain))
-        return Formulation(diffeqsolve, problem.terms, wrapped)
+        return Formulation(diffeqsolve, problem.terms, wrapped, problem.resets)
 
     return formulate
 
@@ -136,7 +140,7 @@ def _of_other_packages() -> tuple[Approach, ...]:
 
 # In the order of the tables.
 APPROACHES: tuple[Approach, ...] = (
-    Approach("plain", _plain, Style("#D55E00")),
+    Approach("plain", _plain, Style("#D55E00"), needs=CONTINUOUS),
     Approach("projected", _projected, Style("#0072B2")),
     Approach("one-step", _one_step, Style("#56B4E9", "dashed")),
     Approach("invariant", _invariant, Style("#009E73"), uses_gain=True),

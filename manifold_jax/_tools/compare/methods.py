@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from .approaches import APPROACHES, Need, Style
+from .approaches import APPROACHES, CONTINUOUS, Need, Style
 from .task import Run, SolveFailed, Task
 from .with_diffrax import run_diffrax
 from .with_scipy import run_scipy
@@ -51,7 +51,12 @@ METHODS: tuple[Method, ...] = (
         for approach in APPROACHES
     ),
     *(
-        Method(f"scipy {name}", functools.partial(run_scipy, method=name), Style(colour, "dotted"))
+        Method(
+            f"scipy {name}",
+            functools.partial(run_scipy, method=name),
+            Style(colour, "dotted"),
+            CONTINUOUS,
+        )
         for name, colour in (("RK45", "#555555"), ("DOP853", "#888888"), ("LSODA", "#BBBBBB"))
     ),
 )

@@ -136,7 +136,7 @@ def _explicit_evaluations(task: Task, solve: Formulation, steps: int) -> int | N
     tableau says so. (A callback that counts takes some 10 us.)
     """
     solver = SOLVERS[task.solver]()
-    if not isinstance(solver, dfx.AbstractERK):
+    if not isinstance(solver, dfx.AbstractERK) or solve.resets:
         return None
     tableau = solver.tableau
     assert isinstance(tableau, dfx.ButcherTableau)  # several are for several vector fields
