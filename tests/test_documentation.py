@@ -90,7 +90,8 @@ def quoted_messages():
 
 def test_quoted_messages_begin_as_in_the_source():
     texts, quoted = tuple(texts_of_the_source()), list(quoted_messages())
-    assert all(quoted) and len(quoted) == len(set(quoted)) > 50
+    assert all(quoted)
+    assert len(quoted) == len(set(quoted)) > 50
     assert [quote for quote in quoted if not any(x.startswith(quote) for x in texts)] == []
 
 
