@@ -7,6 +7,7 @@ import sys
 from operator import attrgetter
 from pathlib import Path
 
+import diffrax as dfx
 import pytest
 from documents import blocks_of, ROOT, run
 
@@ -14,6 +15,7 @@ import manifold_jax as mj
 
 
 PAGES = ROOT / "docs" / "pages"
+MESSAGES = (PAGES / "messages.md").read_text()
 
 
 def public_names():
@@ -65,6 +67,46 @@ def test_cross_references_of_docstrings_name_something_public():
         own = {f"{thing.__name__}.{x}" for x in vars(thing)} if isinstance(thing, type) else set()
         for target in re.findall(r"\[`([\w.]+)`\]\[\]", "\n".join(texts)):
             assert target in anchors | near | own, name
+
+
+def texts_of_the_source():
+    """Every string in the source; in place of what is filled in there is `...`."""
+    for path in Path(mj.__file__).parent.rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.JoinedStr):
+                parts = [x.value if isinstance(x, ast.Constant) else "..." for x in node.values]
+                yield "".join(parts)
+            elif isinstance(node, ast.Constant) and isinstance(node.value, str):
+                yield re.sub(r"\{\w*\}", "...", node.value)
+
+
+def quoted_messages():
+    """The first column of the tables of messages, without the backticks around it."""
+    tables = re.split(r"^\| the message begins with .*\n\|[-|]+\n", MESSAGES, flags=re.MULTILINE)
+    for table in tables[1:]:
+        for row in re.match(r"(?:\|.*\n)*", table)[0].splitlines():
+            yield re.fullmatch(r"\| (`+) ?(.+?) ?\1 \|.*", row)[2].removesuffix("...").rstrip()
+
+
+def test_quoted_messages_begin_as_in_the_source():
+    texts, quoted = tuple(texts_of_the_source()), list(quoted_messages())
+    assert all(quoted)
+    assert len(quoted) == len(set(quoted)) > 50
+    assert [quote for quote in quoted if not any(x.startswith(quote) for x in texts)] == []
+
+
+def test_result_codes_of_the_page_of_messages_are_those_of_diffrax():
+    named = re.findall(r"^\| `RESULTS\.(\w+)` \|", MESSAGES, flags=re.MULTILINE)
+    assert len(named) == 7
+    assert [name for name in named if not hasattr(dfx.RESULTS, name)] == []
+
+
+@pytest.mark.parametrize("page", ["questions", "messages", "glossary"])
+def test_names_in_the_pages_of_help_exist(page):
+    text = (PAGES / f"{page}.md").read_text()
+    for module, prefix in ((mj, "mj"), (dfx, "dfx"), (dfx, "diffrax")):
+        for name in re.findall(rf"\b{prefix}\.([A-Za-z]\w*(?:\.[A-Za-z]\w*)*)", text):
+            attrgetter(name)(module)
 
 
 # The others compile for longer.
