@@ -277,6 +277,14 @@ def test_a_group_for_several_arrays():
         solve(terms=field, solver=solver, y0=(jnp.eye(3), START))
 
 
+def test_a_vector_field_that_would_be_broadcast():
+    field = dfx.ODETerm(lambda t, y, args: -y[:1])
+    with pytest.raises(ValueError, match=r"of shape \(2,\), but returns \(1,\)"):
+        mj.diffeqsolve(field, dfx.Heun(), 0.0, 1.0, 0.1, START)
+    with pytest.raises(ValueError, match=r"of shape \(2,\), but returns \(1,\)"):
+        mj.solve_ensemble(field, dfx.Heun(), 0.0, 1.0, 0.1, START[None])
+
+
 @pytest.mark.parametrize(
     ("call", "new"),
     [

@@ -1,4 +1,5 @@
-"""What the terminal shows of an error: the library's own message comes last, or nearly."""
+"""What is shown of an error: the library's own message comes first, for logs, and last, or nearly, for
+terminals."""
 
 import os
 import subprocess
@@ -20,10 +21,12 @@ MESSAGE = "check that the equations can hold at the same time."
 
 
 @pytest.mark.parametrize("function", [mj.consistent_state, mj.project])
-def test_the_message_is_the_end(function):
+def test_the_message_is_the_beginning_and_the_end(function):
     with pytest.raises(RuntimeError) as error:
         function(NOWHERE, 0.0, START)
-    assert str(error.value).endswith(MESSAGE)
+    first, *_, last = str(error.value).splitlines()
+    assert first == last
+    assert first.endswith(MESSAGE)
     assert "EQX_ON_ERROR" not in str(error.value)
 
 
@@ -31,7 +34,8 @@ def test_errors_of_users_keep_the_place_where_they_occurred():
     def residual(t, y, args):
         return y @ y - eqx.error_if(args, args < 0, "no negative radius, please")
 
-    with pytest.raises(RuntimeError, match="(?s)in residual.*no negative radius, please$"):
+    message = "no negative radius, please"
+    with pytest.raises(RuntimeError, match=f"(?s)^{message}.*in residual.*{message}$"):
         mj.project(mj.Constraint(residual), 0.0, START, jnp.asarray(-1.0))
 
 

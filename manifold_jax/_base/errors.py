@@ -13,8 +13,8 @@ Function = TypeVar("Function", bound=Callable)
 
 
 def clear_errors(function: Function) -> Function:
-    """Wrap a function made by `equinox.filter_jit`. The message of an error comes last, where it is
-    looked for; a call with wrong arguments is told the signature; for an ensemble differentiated in
+    """Wrap a function made by `equinox.filter_jit`. The message of an error comes first, where a log
+    keeps it, and last, where a terminal shows it; a call with wrong arguments is told the signature; for an ensemble differentiated in
     forward mode the message says what to write."""
     signature, name = inspect.signature(function), getattr(function, "__name__", "")
 
@@ -24,7 +24,7 @@ def clear_errors(function: Function) -> Function:
         try:
             return function(*args, **kwargs)
         except eqx.EquinoxRuntimeError as error:
-            raise eqx.EquinoxRuntimeError(_message_last(str(error))) from None
+            raise eqx.EquinoxRuntimeError(_message_first_and_last(str(error))) from None
         except TypeError as error:
             _check_call(name, signature, args, kwargs)
             if "custom_vjp" in str(error) and _is_reverse(signature.parameters, kwargs):
@@ -44,11 +44,12 @@ def _is_reverse(parameters: Any, kwargs: Any) -> bool:
     return "adjoint" in parameters and not isinstance(kwargs.get("adjoint"), dfx.ForwardMode)
 
 
-def _message_last(text: str) -> str:
-    """Return the message without the advice on debugging that Equinox appends."""
+def _message_first_and_last(text: str) -> str:
+    """Return the message around the stack, without the advice on debugging that Equinox appends."""
     stack, found, rest = text.rpartition("equinox.EquinoxRuntimeError: ")
     message, _, _ = rest.partition("\n-------------------\n")
-    return f"{stack}\n{message.strip()}" if found else text
+    message = message.strip()
+    return f"{message}\n\n{stack.strip()}\n\n{message}" if found else text
 
 
 def _check_call(name: str, signature: inspect.Signature, args: Any, kwargs: Any) -> None:

@@ -94,6 +94,16 @@ def explained(function: Function) -> Function:
     return cast(Function, solve)
 
 
+def check_field(terms: Any, t0: Any, y0: Any, args: Any) -> None:
+    """Refuse a user's vector field of another shape than the state, which might be broadcast. Those that
+    this library makes have its shape, and take long to trace."""
+    function = getattr(terms, "vector_field", None)
+    if (getattr(function, "__module__", None) or "").startswith("manifold_jax."):
+        return
+    if fault := fault_of_field(terms, t0, y0, args):
+        raise ValueError(fault)
+
+
 def fault_of_field(terms: Any, t0: Any, y0: Any, args: Any) -> str | None:
     """Return the message for a vector field of another shape than the state."""
     if not isinstance(terms, dfx.ODETerm):

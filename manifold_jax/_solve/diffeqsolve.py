@@ -15,6 +15,7 @@ from .._solver.base import AbstractManifoldSolver
 from .._solver.step.implicit import with_accurate_stages, with_tolerances_of_stages
 from .arguments import (
     check_arguments,
+    check_field,
     check_max_steps,
     explained,
     raise_if_unstable,
@@ -118,6 +119,7 @@ def diffeqsolve(
     Source: Sudarsan & Keerthi, Appl. Math. Comput. 92 (1998) 153-193.
     """
     check_arguments(terms, solver, dt0, saveat, stepsize_controller, adjoint, event, consistent)
+    check_field(terms, t0, y0, args)
     check_max_steps(max_steps)
     check_resets(resets, max_resets, controller_state)
     warn_of_rounding(y0, time_dtype(t0, t1, dt0, saveat), stepsize_controller)

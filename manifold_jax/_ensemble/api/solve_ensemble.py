@@ -16,7 +16,13 @@ from ..._base.errors import clear_errors, refuse_old_names
 from ..._base.numbers import numbers_as_arrays
 from ..._base.types import Args, RealScalarLike, Y
 from ..._resets.reset import check_resets
-from ..._solve.arguments import check_arguments, fault_of_field, warn_of_rounding, without_idle_hook
+from ..._solve.arguments import (
+    check_arguments,
+    check_field,
+    fault_of_field,
+    warn_of_rounding,
+    without_idle_hook,
+)
 from ..._solve.setup import Consistent
 from ..._solve.times import checking_first_step
 from ..lanes.arguments import (
@@ -119,6 +125,7 @@ def solve_ensemble(
     if not isinstance(max_steps, int) or max_steps < 1:
         raise ValueError(f"`max_steps` must be a positive integer, got {max_steps!r}.")
     one = jax.eval_shape(batch.one)
+    check_field(terms, one.t0, one.y0, one.args)
     warn_of_rounding(one.y0, batch.dtype, stepsize_controller)
     solver = without_idle_hook(solver, one.t0, one.y0, one.args)
     equations = LaneEquations(
