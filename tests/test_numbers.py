@@ -102,6 +102,9 @@ def test_reduced_systems_of_other_numbers_are_not_compiled_again():
         # Compiled, and differentiated, as a whole.
         several = jax.vmap(dae.outputs, in_axes=(None, 0, None))(0.0, jnp.stack([z, z]), g)
         np.testing.assert_allclose(several[0][2], tension, rtol=1e-12)
+        trajectories = dae.outputs(jnp.zeros((2, 3)), jnp.broadcast_to(z, (2, 3, 4)), g)
+        jax.tree.map(lambda a, b: np.testing.assert_array_equal(a[1, 2], b), trajectories[0], x)
+        assert trajectories[1][0].shape == (2, 3, 2)
         calls.append(counted)
     assert calls[0] == calls[1]
     slope = jax.grad(lambda g: dae.outputs(0.0, z, g)[0][2])(2.0)

@@ -49,7 +49,7 @@ def reduce_dae(
     dae = mj.reduce_dae(pendulum, {"q": jnp.ones(2), "v": jnp.ones(2), "tension": 1.0})
     z0, _ = dae.consistent_state(0.0, {"q": ..., "v": ..., "tension": 0.0})
     sol = mj.diffeqsolve(dae.terms, mj.Projected(dfx.Tsit5(), dae.constraint), 0.0, 5.0, None, z0)
-    x, xdot = jax.vmap(dae.outputs)(sol.ts, sol.ys)
+    x, xdot = dae.outputs(sol.ts, sol.ys)
     ```
 
     Structure alone decides which equation has to be differentiated how often (`c_i`) and up to

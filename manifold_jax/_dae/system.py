@@ -5,6 +5,7 @@ from typing import Any
 
 import diffrax as dfx
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -86,12 +87,20 @@ class ReducedDAE(eqx.Module):
         guess = Guess.of(self.system, x_guess, derivatives, fixed)
         return consistent_state(self.system, t0, guess, args, throw)
 
-    def outputs(self, t: RealScalarLike, z: Float[Array, " states"], args: Args = None) -> Any:
+    def outputs(self, t: Any, z: Float[Array, "*axes states"], args: Args = None) -> Any:
         """Return all unknowns and their derivatives, `(x, x', ...)`, as many as `F` takes, multipliers
         and other algebraic unknowns included: on the manifold `F(t, *outputs, args) = 0`.
 
-        For one state; use `jax.vmap(dae.outputs, in_axes=(0, 0, None))` for saved ones. Derivatives
-        that are not in the equations are found by differentiating along the solution.
+        ```python
+        x, xdot = dae.outputs(sol.ts, sol.ys, args)  # x["tension"] has a leading axis for the times
+        ```
+
+        **Arguments:**
+
+        - `t`, `z`: a time and a state, or times and states of a solution with the same leading axes.
+        - `args`: the parameters, common to all.
+
+        Derivatives that are not in the equations are found by differentiating along the solution.
         """
         return _outputs(self.system, t, z, args)
 
@@ -152,7 +161,15 @@ class ReducedDAE(eqx.Module):
 
 @numbers_as_arrays("args", times=("t",))
 @eqx.filter_jit
-def _outputs(system: Reduced, t: RealScalarLike, z: Array, args: Args) -> tuple[Any, ...]:
+def _outputs(system: Reduced, t: Any, z: Array, args: Args) -> tuple[Any, ...]:
     """Compiled also when called alone: operation by operation it takes ten times as long."""
-    found = system.unknowns_with_derivatives(t, z, args, system.equations.order)
-    return tuple(system.equations.unravel(x) for x in found)
+
+    def at(t: Array, z: Array) -> tuple[Any, ...]:
+        found = system.unknowns_with_derivatives(t, z, args, system.equations.order)
+        return tuple(system.equations.unravel(x) for x in found)
+
+    axes = jnp.shape(z)[:-1]
+    if axes == ():
+        return at(t, z)
+    several = jax.vmap(at)(jnp.broadcast_to(t, axes).reshape(-1), z.reshape(-1, z.shape[-1]))
+    return jax.tree_util.tree_map(lambda x: x.reshape(*axes, *x.shape[1:]), several)

@@ -29,6 +29,7 @@ from .output import events_in_true_time, saving
 from .prepare import prepare, time_dtype
 from .resets import finish_resets, LoopArguments, with_resets
 from .setup import Consistent, ProblemData, Setup
+from .solution import Solution
 from .times import checking_first_step, refusing_missing_times
 
 
@@ -60,7 +61,7 @@ def diffeqsolve(
     consistent: Consistent = "project",
     resets: Any = (),
     max_resets: int = 100,
-) -> dfx.Solution:
+) -> Solution:
     """Solve a differential equation on a manifold.
 
     Takes the arguments of `diffrax.diffeqsolve` and returns its `Solution`. In addition the
@@ -97,7 +98,7 @@ def diffeqsolve(
 
     **Returns:**
 
-    A `diffrax.Solution`; `sol.stats` has in addition
+    A [`Solution`][]; `sol.stats` has in addition to what Diffrax reports
 
     - `initial_correction`: the distance by which `y0` was moved, the largest `|change| / (|y0| + 1)`;
     - `num_projection_iterations`: Newton iterations over all accepted steps;
@@ -165,7 +166,7 @@ def diffeqsolve(
     # The dense solution, which is returned, holds the original constraint.
     if resets:
         return finish_resets(setup, ready, sol, constraint, saveat.controller_state)
-    return finish(setup, ready, sol, constraint)
+    return Solution.of(finish(setup, ready, sol, constraint))
 
 
 def _as_in_steps(

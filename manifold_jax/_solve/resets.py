@@ -12,12 +12,12 @@ from .._base.compat import use_stepsize_tol
 from .._base.types import Y
 from .._resets.conditions import Conditions
 from .._resets.controller import ResettingController, ResettingState
-from .._resets.record import Resets
 from .._resets.reset import Reset, ResetAt
 from .._resets.solver import ResetState, Resetting
 from .finish import finish
 from .prepare import Ready
 from .setup import Setup
+from .solution import Solution
 
 
 _TRUE_AT_START = (
@@ -43,12 +43,6 @@ class LoopArguments(NamedTuple):
     saveat: dfx.SaveAt
     solver_state: Any
     y0: Y
-
-
-class SolutionWithResets(dfx.Solution):
-    """The solution of [`diffeqsolve`][] with `resets`, which `resets` reports."""
-
-    resets: Resets
 
 
 def with_resets(
@@ -90,7 +84,7 @@ def _with_tolerances(solver: Any, controller: Any) -> Any:
 
 def finish_resets(
     setup: Setup, ready: Ready, sol: dfx.Solution, constraint: Any, keeps_controller_state: bool
-) -> SolutionWithResets:
+) -> Solution:
     """Report a solve with resets."""
     state, controller_state = sol.solver_state, sol.controller_state
     assert isinstance(state, ResetState)
@@ -104,7 +98,6 @@ def finish_resets(
     too_many = controller_state.record.number > resets.times.size
     faults = [(too_many, TOO_MANY_RESETS), (state.history.failed, NO_STATE_AFTER)]
     sol = finish(setup, ready, sol, constraint, faults)
-    fields = {name: getattr(sol, name) for name in dfx.Solution.__dataclass_fields__}
     if not setup.saveat.solver_state:
-        fields["solver_state"] = None
-    return SolutionWithResets(**fields, resets=resets)
+        sol = eqx.tree_at(lambda s: s.solver_state, sol, None, is_leaf=lambda x: x is None)
+    return Solution.of(sol, resets)
