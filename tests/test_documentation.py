@@ -109,6 +109,14 @@ def test_names_in_the_pages_of_help_exist(page):
             attrgetter(name)(module)
 
 
+def test_the_gallery_shows_every_problem():
+    page = (PAGES / "gallery.md").read_text()
+    for name in mj.problems.ALL | mj.problems.FURTHER:
+        assert f"](gallery/{name}.png)" in page
+        assert f"[`{name}`][" in page
+        assert (PAGES / "gallery" / f"{name}.png").exists()
+
+
 # The others compile for longer.
 QUICK = {"failing-trajectories", "extending"}
 # What is set before JAX and Equinox are imported.
