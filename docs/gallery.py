@@ -21,7 +21,10 @@ FOLDER = Path(__file__).parent / "pages" / "gallery"
 GALLERY = mj.problems.ALL | mj.problems.FURTHER
 SMALLER = {"n-four-bar": lambda: mj.problems.n_four_bar(4)}
 # Mechanisms are shown at the start and until this time, in seconds; these longer.
-UNTIL, LONGER = 0.6, {"compass-gait": 12.0, "falling-truss": 2.0, "slider-crank": 4.0}
+UNTIL, LONGER = (
+    0.6,
+    {"compass-gait": 12.0, "falling-truss": 2.0, "slider-crank": 4.0, "newtons-cradle": 0.9},
+)
 BLUE = "#0072B2"
 
 

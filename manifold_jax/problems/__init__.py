@@ -20,6 +20,7 @@ from .kepler import kepler as kepler
 from .lotka_volterra import lotka_volterra as lotka_volterra
 from .matrix_flows import rotation as rotation, sphere_flow as sphere_flow
 from .n_four_bar import n_four_bar as n_four_bar
+from .newtons_cradle import newtons_cradle as newtons_cradle
 from .oscillator import harmonic_oscillator as harmonic_oscillator
 from .parallelogram import parallelogram as parallelogram
 from .pendulum import pendulum as pendulum, spherical_pendulum as spherical_pendulum
@@ -41,5 +42,5 @@ ALL = _named(
     spherical_pendulum, heavy_top, rolling_disc,
 )  # fmt: skip
 FURTHER = _named(
-    compass_gait, delta_robot, stewart_platform, n_four_bar, cable_net, falling_truss, polymer,
+    compass_gait, newtons_cradle, delta_robot, stewart_platform, n_four_bar, cable_net, falling_truss, polymer,
 )  # fmt: skip

@@ -43,20 +43,28 @@ def integrate(
     return states
 
 
+class _Falls:
+    """An event of SciPy that ends an integration where the condition falls through zero."""
+
+    terminal, direction = True, -1
+
+    def __init__(self, condition: Callable[[float, np.ndarray], float]):
+        self.condition = condition
+
+    def __call__(self, t: float, x: np.ndarray) -> float:
+        return self.condition(t, x)
+
+
 def integrate_with_resets(
     field: Callable[[float, np.ndarray], Sequence[float] | np.ndarray],
     x0: Sequence[float] | np.ndarray,
     t: np.ndarray,
-    condition: Callable[[float, np.ndarray], float],
-    jump: Callable[[float, np.ndarray], np.ndarray],
+    conditions: Sequence[Callable[[float, np.ndarray], float]],
+    jump: Callable[[int, np.ndarray], np.ndarray],
 ) -> np.ndarray:
-    """Solve from time 0 forwards as `integrate` does, restarted with `jump(t, x)` where
-    `condition(t, x)` falls through zero. At these times the states are those after the jump."""
-
-    def falls(t: float, x: np.ndarray) -> float:
-        return condition(t, x)
-
-    falls.terminal, falls.direction = True, -1
+    """Solve from time 0 forwards as `integrate` does, restarted with `jump(i, x)` where
+    `conditions[i](t, x)` falls through zero. At these times the states are those after the jump."""
+    events = [_Falls(condition) for condition in conditions]
     start, end, x = 0.0, float(np.max(t, initial=0.0)), np.asarray(x0, np.float64)
     if np.any(t < 0):
         raise ValueError("The solution with jumps is not known before the start.")
@@ -70,13 +78,14 @@ def integrate_with_resets(
             rtol=3e-14,
             atol=1e-15,
             dense_output=True,
-            events=falls,
+            events=events,
         )
         inside = t >= start
         states[inside] = solution.sol(np.minimum(t[inside], solution.t[-1])).T
         start, x = solution.t[-1], solution.y[:, -1]
         if solution.status == 1:
-            x = jump(start, x)
+            number = next(i for i, times in enumerate(solution.t_events) if times.size)
+            x = jump(number, x)
             states[t >= start] = x
     return states
 

@@ -115,9 +115,9 @@ def _exact(t: np.ndarray, args: CompassGaitArgs, y0: Any) -> tuple[np.ndarray, n
         return np.concatenate([x[2:], np.linalg.solve(masses, forces)])
 
     strike = lambda t, x: max(x[0] + x[1], x[0])
-    exchange = lambda t, x: _after_strike(x, (M, m, inertia, length, c))
+    exchange = lambda _, x: _after_strike(x, (M, m, inertia, length, c))
     x0 = np.array([*y0[0][2:], *y0[1][2:]])
-    a, b, u, w = integrate_with_resets(field, x0, t, strike, exchange).T
+    a, b, u, w = integrate_with_resets(field, x0, t, [strike], exchange).T
     q = [-length * np.sin(a), length * np.cos(a), a, b]
     v = [-length * np.cos(a) * u, -length * np.sin(a) * u, u, w]
     return np.stack(q, axis=1), np.stack(v, axis=1)

@@ -10,6 +10,12 @@ def sketch_chain(motion: DrawnMotion) -> Lines:
     return [np.concatenate([np.zeros((len(motion.q), 1, 2)), joints], axis=1)]
 
 
+def sketch_newtons_cradle(motion: DrawnMotion) -> Lines:
+    spacing = float(motion.args.spacing)
+    balls = enumerate(np.moveaxis(motion.q, 1, 0))
+    return [line_through((i * spacing, 0.0), tuple(ball.T)) for i, ball in balls]
+
+
 def sketch_slider_crank(motion: DrawnMotion) -> Lines:
     """Draw the rod from the slider, with length 1."""
     crank, slider, rod = motion.q.T

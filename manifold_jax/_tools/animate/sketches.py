@@ -13,6 +13,7 @@ SKETCHES: dict[str, Sketch] = {
     "n-four-bar": planar.sketch_n_four_bar,
     "parallelogram": planar.sketch_parallelogram,
     "falling-truss": planar.sketch_falling_truss,
+    "newtons-cradle": planar.sketch_newtons_cradle,
     "compass-gait": planar.sketch_compass_gait,
     "spherical-pendulum": spatial.sketch_rod,
     "polymer": spatial.sketch_beads,

@@ -19,7 +19,7 @@ def animate(
         typer.Argument(
             metavar="PROBLEM",
             help="A mechanism of the gallery: pendulum, double-pendulum, chain, slider-crank, "
-            "four-bar, n-four-bar, parallelogram, falling-truss, compass-gait, spherical-pendulum, "
+            "four-bar, n-four-bar, parallelogram, falling-truss, compass-gait, newtons-cradle, spherical-pendulum, "
             "polymer, cable-net, delta-robot, stewart-platform.",
         ),
     ],
