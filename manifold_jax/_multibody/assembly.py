@@ -1,6 +1,6 @@
 """The assembly of bodies, joints and forces, as a mechanical system."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -9,16 +9,18 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from .._base.numbers import numbers_as_arrays
 from .._base.types import Args, RealScalarLike
 from .._mechanics import MechanicalSystem
 from .bodies import Bodies, Body, Pose
 from .checks import check_shape, floating
 from .equations import DRIVEN
 from .forces import AbstractForce
-from .frames import Frames, in_space
+from .frames import Frames, in_space, Placed, with_ground
 from .joint_groups import group_restraints, JointGroup, reactions, residuals
 from .joints import AbstractRestraint, Revolute
 from .loads import AbstractLoads, group_forces
+from .picture import draw_outline, new_axes, outline_of, write_film
 from .reading import Energy, JointForce, Motion, over_times, Times
 from .rotations import rates_matrix, turn
 from .start import make_state
@@ -133,11 +135,13 @@ class Assembly(eqx.Module):
         given = positions, orientations, velocities, angular_velocities
         return make_state(self, given, assemble, floating(t), args)
 
-    def gaps(
-        self, q: Pose, t: RealScalarLike = 0.0, args: Args = None
-    ) -> dict[str, Float[Array, " r"]]:
+    def gaps(self, q: Pose, t: Times = 0.0, args: Args = None) -> dict[str, Float[Array, "*t r"]]:
         """Return residuals of the joints by name at the positions `q` of a state `(q, v)`: lengths in
-        metres, cosines of angles. `t` and `args` are those of [`Drive`][]s, whose angles are in rad."""
+        metres, cosines of angles. `t` and `args` are those of [`Drive`][]s, whose angles are in rad. `q` may
+        have a leading axis, as in `sol.ys`, with the times `sol.ts`."""
+        if q.position.ndim > 2:
+            times = jnp.broadcast_to(floating(t), q.position.shape[:1])
+            return jax.vmap(lambda q, t: self.gaps(q, t, args))(q, times)
         rows = (row for part in residuals(self.joints_at(t, args), q) for row in part)
         return dict(zip(self.joint_names, rows, strict=True))
 
@@ -152,13 +156,19 @@ class Assembly(eqx.Module):
         return Motion(q.position[i], q.orientation[i], v.position[i], spin)
 
     @over_times
-    def point(self, y: tuple[Pose, Pose], name: str, at: Any) -> tuple[Array, Array]:
-        """Return position and velocity in world coordinates of the point `at` in the frame of a body."""
+    def point(
+        self, y: tuple[Pose, Pose], name: str, at: Any, *, drawn: bool = False
+    ) -> tuple[Array, Array]:
+        """Return position and velocity in world coordinates of a point of a body: `at` in its frame, or
+        with `drawn=True` where it is in the drawing, as for joints."""
         d = 2 if self.bodies.planar else 3
         i = self.bodies.index(name, "`point`")
-        at = check_shape("`at`", at, (d,))
+        at = in_space(check_shape("`at`", at, (d,)))
+        if drawn:
+            drawing = Placed.of(with_ground(self.bodies.drawing.coordinates)[i])
+            at = drawing.rotation.T @ (at - drawing.origin)
         frames = Frames.of(*y)
-        arm = frames.rotation[i][:, :d] @ at
+        arm = frames.rotation[i] @ at
         velocity = frames.velocity[i] + jnp.cross(frames.spin[i], arm)
         return (frames.origin[i] + arm)[:d], velocity[:d]
 
@@ -179,21 +189,10 @@ class Assembly(eqx.Module):
         """Return force and torque of every joint on its second body, from the multipliers, at the time
         `t` or the times of all states. With `redundant` joints only the sum over those that depend on
         each other is determined."""
-        if y[0].position.ndim > 2:
-            times = jnp.broadcast_to(floating(t), y[0].position.shape[:1])
-            return jax.vmap(lambda t, y: self.joint_forces(t, y, args))(times, y)
-        multipliers, frames = self.system.multipliers(t, y, args), Frames.of(*y)
-        found, start = {}, 0
-        for group in self.joints_at(t, args):
-            k, r = group.residual(group.attachment.sides(frames)).shape
-            own = multipliers[start : start + k * r].reshape(k, r)
-            start += k * r
-            forces, torques = reactions(group, frames, own)
-            if self.bodies.planar:
-                forces, torques = forces[:, :2], torques[:, 2]
-            on_second = map(JointForce, forces, torques)
-            found |= dict(zip(group.attachment.names, on_second, strict=True))
-        return found
+        if y[0].position.ndim == 2:
+            return _joint_forces(self, t, y, args)
+        times = jnp.broadcast_to(floating(t), y[0].position.shape[:1])
+        return jax.vmap(lambda t, y: _joint_forces(self, t, y, args))(times, y)
 
     @over_times
     def energy(self, y: tuple[Pose, Pose]) -> Energy:
@@ -210,6 +209,74 @@ class Assembly(eqx.Module):
         stored = sum((loads.potential(frames) for loads in self.loads), weight)
         return Energy((moving + turning) / 2, stored)
 
+    def draw(
+        self,
+        y: tuple[Pose, Pose],
+        *,
+        markers: Mapping[str, tuple[str, Any]] | None = None,
+        ax: Any = None,
+    ) -> Any:
+        """Draw a state, or the last of several, and return the Matplotlib axes.
+
+        Bodies are lines through the points of their joints and forces, each drawn from its own coordinates:
+        where a joint does not hold they do not meet. A mechanism in space is seen from the front (against
+        y) and a little from above (z).
+
+        **Arguments:**
+
+        - `y`: a state, or states with a leading axis such as `sol.ys`.
+        - `markers`: named points, `{"foot": ("shank", (0.3, -0.8))}`: a body, and where the point is in the
+            drawing. Their paths are drawn through all states.
+        - `ax`: axes to draw into; by default those of a new figure.
+
+        Needs Matplotlib (extra `cli`).
+        """
+        ax = new_axes() if ax is None else ax
+        draw_outline(outline_of(self, y, markers), ax, -1)
+        return ax
+
+    def animate(
+        self,
+        y: tuple[Pose, Pose],
+        path: Any,
+        *,
+        seconds: float = 5.0,
+        markers: Mapping[str, tuple[str, Any]] | None = None,
+    ) -> None:
+        """Write a film, a GIF, of states with a leading axis, at times in equal intervals: as `draw`
+        shows them, over so many `seconds`.
+
+        ```python
+        ts = jnp.linspace(0, 4, 81)  # in real time:
+        robot.animate(sol.ys, "robot.gif", seconds=4.0, markers={"tool": ("platform", (0.0, 0.0, -0.6))})
+        ```
+        """
+        if y[0].position.ndim != 3:
+            raise ValueError(
+                "`y` must be states with a leading axis for the times, such as `sol.ys`; a single one is drawn by `draw`."
+            )
+        write_film(outline_of(self, y, markers), path, seconds)
+
     def joints_at(self, t: RealScalarLike, args: Args) -> tuple[JointGroup, ...]:
         """Return the joints with the motions of drives at that time."""
         return tuple(group.at(t, args) for group in self.joints)
+
+
+@numbers_as_arrays("args", times=("t",))
+@eqx.filter_jit
+def _joint_forces(
+    assembly: Assembly, t: RealScalarLike, y: tuple[Pose, Pose], args: Args
+) -> dict[str, JointForce]:
+    """Compiled also when called alone: operation by operation it takes many times as long."""
+    multipliers, frames = assembly.system.multipliers(t, y, args), Frames.of(*y)
+    found, start = {}, 0
+    for group in assembly.joints_at(t, args):
+        k, r = group.residual(group.attachment.sides(frames)).shape
+        own = multipliers[start : start + k * r].reshape(k, r)
+        start += k * r
+        forces, torques = reactions(group, frames, own)
+        if assembly.bodies.planar:
+            forces, torques = forces[:, :2], torques[:, 2]
+        on_second = map(JointForce, forces, torques)
+        found |= dict(zip(group.attachment.names, on_second, strict=True))
+    return found

@@ -82,9 +82,8 @@ def _exact(t: np.ndarray, args: NewtonsCradleArgs, y0: Any) -> tuple[np.ndarray,
     pivots = float(args.spacing) * np.arange(n)
     places = lambda a: np.stack([pivots + L * np.sin(a), -L * np.cos(a)], axis=-1)
     along = lambda a: np.stack([np.cos(a), np.sin(a)], axis=-1)
-    gap = lambda i: (
-        lambda t, x: np.linalg.norm(np.diff(places(x[:n]), axis=0)[i]) - 2 * float(args.radius)
-    )
+    distances = lambda x: np.linalg.norm(np.diff(places(x[:n]), axis=0), axis=1)
+    gap = lambda i: lambda t, x: float(distances(x)[i] - 2 * args.radius)
 
     def field(t: float, x: np.ndarray) -> np.ndarray:
         return np.concatenate([x[n:], -float(args.gravity) / L * np.sin(x[:n])])
