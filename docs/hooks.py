@@ -25,6 +25,8 @@ FOLDERS = {
 _LINK = re.compile(r"(?<!!)\[([^\]]+)\]\(([^)#]+)\)")
 _TEXT_CELL = re.compile(r'<div class="[^"]*jp-RenderedMarkdown.*?</div>', re.DOTALL)
 _FORMULA = re.compile(r"\$\$(.+?)\$\$|\$([^$]+)\$", re.DOTALL)
+# Links come first, so that an image within one stays as it is.
+_IMAGE = re.compile(r'<a\b.*?</a>|<img\b[^>]*?\bsrc="([^"]+)"[^>]*>', re.DOTALL)
 _OBJECT = re.compile(r"^::: manifold_jax\.([\w.]+)$", re.MULTILINE)
 
 
@@ -63,12 +65,17 @@ def _with_anchors(match: re.Match[str]) -> str:
 
 
 def on_page_content(html: str, page: Any, **_: Any) -> str:
-    """Of notebooks: formulas as on other pages, and without the scripts that would load MathJax and
-    Mermaid from elsewhere."""
+    """Images become links to their files. Of notebooks: formulas as on other pages, and without the
+    scripts that would load MathJax and Mermaid from elsewhere."""
     if not page.file.src_uri.endswith(".ipynb"):
-        return html
+        return _IMAGE.sub(_enlargeable, html)
     html = re.sub(r"<script\b.*?</script>", "", html, flags=re.DOTALL)
     return _TEXT_CELL.sub(lambda text: _FORMULA.sub(_formula, text[0]), html)
+
+
+def _enlargeable(match: re.Match[str]) -> str:
+    image, source = match[0], match[1]
+    return f'<a class="image-link" href="{source}">{image}</a>' if source else image
 
 
 def _formula(match: re.Match[str]) -> str:
