@@ -1,6 +1,8 @@
 """What this site does beyond its plugins: formulas as MathML, pages made of files elsewhere in the
 repository, and short names in cross references."""
 
+import base64
+import json
 import re
 from html import unescape
 from pathlib import Path
@@ -41,9 +43,21 @@ def on_files(files: Files, config: Any) -> Files:
         for path in sorted(path for pattern in patterns for path in folder.glob(pattern)):
             uri = f"{name}/{path.relative_to(folder).as_posix()}"
             files.append(File(uri, str(folder.parent), config.site_dir, config.use_directory_urls))
+    for path in sorted((ROOT / "notebooks").glob("*.ipynb")):
+        if picture := _last_picture(path):
+            uri = f"notebooks/{path.stem}.png"
+            files.append(File.generated(config, uri, content=picture))
     for uri, path in PAGES.items():
         files.append(File.generated(config, uri, content=_linked(path.read_text(), files)))
     return files
+
+
+def _last_picture(notebook: Path) -> bytes | None:
+    """For pages that show what is in a notebook."""
+    cells = json.loads(notebook.read_text())["cells"]
+    shown = [output.get("data", {}) for cell in cells for output in cell.get("outputs", ())]
+    pictures = ["".join(data["image/png"]) for data in shown if "image/png" in data]
+    return base64.b64decode(pictures[-1]) if pictures else None
 
 
 def _linked(text: str, files: Files) -> str:
