@@ -1,6 +1,8 @@
 """What this site does beyond its plugins: formulas as MathML, pages made of files elsewhere in the
 repository, and short names in cross references."""
 
+import base64
+import json
 import re
 from html import unescape
 from pathlib import Path
@@ -25,6 +27,8 @@ FOLDERS = {
 _LINK = re.compile(r"(?<!!)\[([^\]]+)\]\(([^)#]+)\)")
 _TEXT_CELL = re.compile(r'<div class="[^"]*jp-RenderedMarkdown.*?</div>', re.DOTALL)
 _FORMULA = re.compile(r"\$\$(.+?)\$\$|\$([^$]+)\$", re.DOTALL)
+# Links come first, so that an image within one stays as it is.
+_IMAGE = re.compile(r'<a\b.*?</a>|<img\b[^>]*?\bsrc="([^"]+)"[^>]*>', re.DOTALL)
 _OBJECT = re.compile(r"^::: manifold_jax\.([\w.]+)$", re.MULTILINE)
 
 
@@ -39,9 +43,21 @@ def on_files(files: Files, config: Any) -> Files:
         for path in sorted(path for pattern in patterns for path in folder.glob(pattern)):
             uri = f"{name}/{path.relative_to(folder).as_posix()}"
             files.append(File(uri, str(folder.parent), config.site_dir, config.use_directory_urls))
+    for path in sorted((ROOT / "notebooks").glob("*.ipynb")):
+        if picture := _last_picture(path):
+            uri = f"notebooks/{path.stem}.png"
+            files.append(File.generated(config, uri, content=picture))
     for uri, path in PAGES.items():
         files.append(File.generated(config, uri, content=_linked(path.read_text(), files)))
     return files
+
+
+def _last_picture(notebook: Path) -> bytes | None:
+    """For pages that show what is in a notebook."""
+    cells = json.loads(notebook.read_text())["cells"]
+    shown = [output.get("data", {}) for cell in cells for output in cell.get("outputs", ())]
+    pictures = ["".join(data["image/png"]) for data in shown if "image/png" in data]
+    return base64.b64decode(pictures[-1]) if pictures else None
 
 
 def _linked(text: str, files: Files) -> str:
@@ -63,12 +79,17 @@ def _with_anchors(match: re.Match[str]) -> str:
 
 
 def on_page_content(html: str, page: Any, **_: Any) -> str:
-    """Of notebooks: formulas as on other pages, and without the scripts that would load MathJax and
-    Mermaid from elsewhere."""
+    """Images become links to their files. Of notebooks: formulas as on other pages, and without the
+    scripts that would load MathJax and Mermaid from elsewhere."""
     if not page.file.src_uri.endswith(".ipynb"):
-        return html
+        return _IMAGE.sub(_enlargeable, html)
     html = re.sub(r"<script\b.*?</script>", "", html, flags=re.DOTALL)
     return _TEXT_CELL.sub(lambda text: _FORMULA.sub(_formula, text[0]), html)
+
+
+def _enlargeable(match: re.Match[str]) -> str:
+    image, source = match[0], match[1]
+    return f'<a class="image-link" href="{source}">{image}</a>' if source else image
 
 
 def _formula(match: re.Match[str]) -> str:

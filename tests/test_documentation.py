@@ -1,6 +1,7 @@
 """The site has a place for everything."""
 
 import ast
+import inspect
 import re
 import subprocess
 import sys
@@ -99,6 +100,22 @@ def test_result_codes_of_the_page_of_messages_are_those_of_diffrax():
     named = re.findall(r"^\| `RESULTS\.(\w+)` \|", MESSAGES, flags=re.MULTILINE)
     assert len(named) == 7
     assert [name for name in named if not hasattr(dfx.RESULTS, name)] == []
+    explained = (PAGES / "how-to" / "failing-trajectories.md").read_text()
+    assert [name for name in named if f"| `RESULTS.{name}` |" not in explained] == []
+
+
+def test_signatures_of_the_site_are_those_of_the_classes(monkeypatch):
+    """Those of classes whose `__init__` is generated are put together in docs/signatures.py."""
+    griffe = pytest.importorskip("griffe")
+    monkeypatch.syspath_prepend(ROOT / "docs")
+    extensions = griffe.load_extensions("signatures")
+    options = dict(search_paths=[ROOT], allow_inspection=False, extensions=extensions)
+    package = griffe.load("manifold_jax", resolve_aliases=True, **options)
+    for name in public_names():
+        thing = attrgetter(name)(mj)
+        if isinstance(thing, type) and not thing.__name__.startswith("Abstract"):
+            shown = [p.name for p in package[name].all_members["__init__"].parameters]
+            assert shown == ["self", *inspect.signature(thing).parameters], name
 
 
 @pytest.mark.parametrize("page", ["questions", "messages", "glossary"])

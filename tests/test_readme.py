@@ -99,7 +99,7 @@ def test_examples_run_one_after_the_other():
 
 
 def test_it_is_short():
-    assert len(README.read_text().splitlines()) <= 165
+    assert len(README.read_text().splitlines()) <= 150
 
 
 def test_commands_are_there():
