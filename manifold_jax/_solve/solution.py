@@ -18,9 +18,10 @@ class Solution(dfx.Solution):
     - `resets`: the jumps ([`Resets`][]) of a solve with `resets`, otherwise `None`.
     """
 
-    # They are what was saved, which a type checker does not know.
+    # What was saved, whose type a checker does not know, and its interpolation, which is corrected.
     ts: Any
     ys: Any
+    interpolation: Any
     resets: Any
 
     @staticmethod
