@@ -25,6 +25,7 @@ FOLDERS = {
     "results": (ROOT / "benchmarks" / "results", ("**/*.png", "**/*.json", "**/*.gif")),
 }
 _LINK = re.compile(r"(?<!!)\[([^\]]+)\]\(([^)#]+)\)")
+_PAGE = re.compile(r'href="\.\./docs/pages/([\w/-]+)\.md')  # as the repository has it
 _TEXT_CELL = re.compile(r'<div class="[^"]*jp-RenderedMarkdown.*?</div>', re.DOTALL)
 _FORMULA = re.compile(r"\$\$(.+?)\$\$|\$([^$]+)\$", re.DOTALL)
 # Links come first, so that an image within one stays as it is.
@@ -79,11 +80,12 @@ def _with_anchors(match: re.Match[str]) -> str:
 
 
 def on_page_content(html: str, page: Any, **_: Any) -> str:
-    """Images become links to their files. Of notebooks: formulas as on other pages, and without the
-    scripts that would load MathJax and Mermaid from elsewhere."""
+    """Images become links to their files. Of notebooks: formulas and links as on other pages, and without
+    the scripts that would load MathJax and Mermaid from elsewhere."""
     if not page.file.src_uri.endswith(".ipynb"):
         return _IMAGE.sub(_enlargeable, html)
     html = re.sub(r"<script\b.*?</script>", "", html, flags=re.DOTALL)
+    html = _PAGE.sub(r'href="../\1.html', html)
     return _TEXT_CELL.sub(lambda text: _FORMULA.sub(_formula, text[0]), html)
 
 
