@@ -58,7 +58,7 @@ class StepReplayAdjoint(dfx.AbstractAdjoint):
     - `checkpoints`: the largest number of states to record. By default those of the first 512 steps, or
         as many as fit into 1 MiB, and about `sqrt(max_steps)` of the others; the states between two of
         these are computed again, once, about `sqrt(max_steps)` at a time. `checkpoints=max_steps`
-        records every state. Memory, besides these states: three numbers for each of `max_steps`.
+        records every state. Memory, besides these states: two numbers for each of `max_steps`.
 
     **Raises:**
 

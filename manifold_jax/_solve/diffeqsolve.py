@@ -8,7 +8,7 @@ import equinox as eqx
 from .._adjoint import CheckedStartAdjoint, LocatingAdjoint, StepReplayAdjoint
 from .._base.errors import clear_errors
 from .._base.numbers import numbers_as_arrays
-from .._base.types import Args, RealScalarLike, Y
+from .._base.types import Args, RealScalarLike, Terms, Y
 from .._base.user_functions import evaluated
 from .._resets.reset import check_resets
 from .._solver.base import AbstractManifoldSolver
@@ -40,7 +40,7 @@ from .times import checking_first_step, refusing_missing_times
 @refusing_missing_times
 @explained
 def diffeqsolve(
-    terms: Any,
+    terms: Terms,
     solver: dfx.AbstractSolver,
     t0: RealScalarLike,
     t1: RealScalarLike,
