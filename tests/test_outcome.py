@@ -131,6 +131,7 @@ def test_a_solve_of_diffrax_is_what_it_was():
         args = dfx.ODETerm(turn), dfx.Heun(), *times, START
         options = dict(saveat=saveat, max_steps=16)
         ours, theirs = mj.diffeqsolve(*args, **options), dfx.diffeqsolve(*args, **options)
+        theirs = mj.Solution.of(theirs)
         same = jax.tree.map(lambda a, b: np.array_equal(a, b, equal_nan=True), ours, theirs)
         assert all(jax.tree.leaves(same))
 

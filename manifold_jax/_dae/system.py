@@ -164,7 +164,7 @@ class ReducedDAE(eqx.Module):
 def _outputs(system: Reduced, t: Any, z: Array, args: Args) -> tuple[Any, ...]:
     """Compiled also when called alone: operation by operation it takes ten times as long."""
 
-    def at(t: Array, z: Array) -> tuple[Any, ...]:
+    def at(t: Any, z: Array) -> tuple[Any, ...]:
         found = system.unknowns_with_derivatives(t, z, args, system.equations.order)
         return tuple(system.equations.unravel(x) for x in found)
 
