@@ -33,6 +33,7 @@ from ._mechanics import (
     Baumgarte as Baumgarte,
     impact as impact,
     MechanicalSystem as MechanicalSystem,
+    rattle as rattle,
     VelocityStabilization as VelocityStabilization,
 )
 from ._resets.record import Resets as Resets
