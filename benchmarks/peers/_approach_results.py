@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 
-from manifold_jax._tools.compare.approaches import APPROACHES, default_gain
+from manifold_jax._tools.compare.approaches import default_gain, known_approaches
 from manifold_jax._tools.compare.report import sizes
 from manifold_jax._tools.compare.task import as_rows
 from manifold_jax._tools.compare.with_diffrax import SOLVERS
@@ -84,7 +84,7 @@ def prepare(
     """The candidates, and the reasons why some could not be prepared."""
     candidates: dict[str, Candidate] = {}
     failures: dict[str, str] = {}
-    approaches = {approach.name: approach for approach in APPROACHES}
+    approaches = {approach.name: approach for approach in known_approaches()}
     scipy_methods = {f"scipy-{method.lower()}": method for method in SCIPY_METHODS}
     for name in methods:
         tell(f"{problem.name}: compiling {name}")

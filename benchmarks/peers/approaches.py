@@ -15,7 +15,7 @@ import diffrax as dfx
 import typer
 from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
-from manifold_jax._tools.compare.approaches import APPROACHES
+from manifold_jax._tools.compare.approaches import known_approaches
 from manifold_jax._tools.compare.with_diffrax import SOLVERS
 from manifold_jax.problems import ALL
 
@@ -29,7 +29,7 @@ from ._candidates import MAX_STEPS, OUTPUT_POINTS, SCIPY_METHODS
 
 PROBLEMS = ("pendulum", "double-pendulum", "slider-crank", "rigid-body", "kepler", "four-bar")
 METHODS = (
-    *(approach.name for approach in APPROACHES),
+    *(approach.name for approach in known_approaches()),
     *(f"scipy-{method.lower()}" for method in SCIPY_METHODS),
 )
 TOLERANCES = tuple(10.0**-k for k in range(3, 11))

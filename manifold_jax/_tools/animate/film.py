@@ -14,7 +14,7 @@ from matplotlib.animation import FuncAnimation, PillowWriter
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from ..compare.approaches import Approach, APPROACHES
+from ..compare.approaches import Approach, known_approaches
 from ..compare.task import as_rows, Task
 from ..compare.with_diffrax import LAST_MAX_STEPS, solve_task, SOLVERS
 from .motion import DrawnMotion
@@ -37,7 +37,7 @@ class Take(NamedTuple):
 def write_film(path: Path, task: Task, seconds: float) -> list[Take]:
     """Write the last `seconds` of the task, in real time, as a GIF."""
     times = task.t1 - seconds + np.arange(round(seconds * _RATE)) / _RATE
-    shown = [one for one in APPROACHES if one.name in _SHOWN]
+    shown = [one for one in known_approaches() if one.name in _SHOWN]
     takes = [_take(task, one, times) for one in shown if _applies(one, task)]
     matplotlib.use("Agg")
     figure = Figure(figsize=(7.2, 4.0), dpi=_DPI, layout="constrained")

@@ -202,10 +202,10 @@ def certify(
         )
     check_target(json, "--json", None)
     from .. import certify as _certify
-    from ..compare.approaches import APPROACHES
+    from ..compare.approaches import known_approaches
     from ..compare.with_diffrax import SOLVERS
 
-    known = {approach.name: approach for approach in APPROACHES}
+    known = {approach.name: approach for approach in known_approaches()}
     chosen, left_out = choose(methods, known, task)
     steppers = [SOLVERS[name]() for name in names_in(solvers, SOLVERS, "solver", "--solvers")]
     every = _certify.ADJOINTS

@@ -1,6 +1,7 @@
 """The approaches to a manifold: each turns a problem into terms and a solver for Diffrax."""
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from importlib.metadata import entry_points
 from typing import Any, NamedTuple
@@ -139,7 +140,7 @@ def _of_other_packages() -> tuple[Approach, ...]:
 
 
 # In the order of the tables.
-APPROACHES: tuple[Approach, ...] = (
+_OWN: tuple[Approach, ...] = (
     Approach("plain", _plain, Style("#D55E00"), needs=CONTINUOUS),
     Approach("projected", _projected, Style("#0072B2")),
     Approach("one-step", _one_step, Style("#56B4E9", "dashed")),
@@ -149,8 +150,13 @@ APPROACHES: tuple[Approach, ...] = (
     Approach("tangent", _tangent, Style("#CC79A7")),
     Approach("partition", _partition, Style("#CC79A7", "dashed")),
     Approach("lie-group", _lie_group, Style("#CC79A7", "dotted"), needs=CHART),
-    *_of_other_packages(),
 )
+
+
+@functools.cache
+def known_approaches() -> tuple[Approach, ...]:
+    """Return the approaches of this library and of other packages; a function, as these import this module."""
+    return (*_OWN, *_of_other_packages())
 
 
 def with_vector_field(terms: Any, wrap: Callable[[Callable], Callable]) -> Any:

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from .approaches import APPROACHES, CONTINUOUS, Need, Style
+from .approaches import CONTINUOUS, known_approaches, Need, Style
 from .task import Run, SolveFailed, Task
 from .with_diffrax import run_diffrax
 from .with_scipy import run_scipy
@@ -48,7 +48,7 @@ METHODS: tuple[Method, ...] = (
             approach.style,
             approach.needs,
         )
-        for approach in APPROACHES
+        for approach in known_approaches()
     ),
     *(
         Method(

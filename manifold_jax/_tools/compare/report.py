@@ -18,7 +18,7 @@ from rich.table import Column, Table
 
 from ... import __version__
 from ...problems import Problem
-from .approaches import APPROACHES
+from .approaches import known_approaches
 from .methods import Measurement, Method
 from .task import OUTPUT_POINTS, Task
 
@@ -111,7 +111,7 @@ def comparison_notes(
         "Run: median, output included. SciPy calls the compiled field from Python and does not "
         "report rejected steps.",
     ]
-    with_gain = {approach.name for approach in APPROACHES if approach.uses_gain}
+    with_gain = {approach.name for approach in known_approaches() if approach.uses_gain}
     stabilized = [m.key for m in measurements if m.key in with_gain]
     if stabilized:
         notes.append(
