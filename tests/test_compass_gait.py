@@ -1,7 +1,5 @@
 """A walker: its published limit cycle, the multipliers and the speed of that."""
 
-import functools
-
 import diffrax as dfx
 import jax
 import jax.numpy as jnp
@@ -85,8 +83,9 @@ def test_speed_of_the_designed_gait():
 
     solver = optx.Newton(rtol=1e-11, atol=1e-11)
 
-    @functools.partial(jax.jit, static_argnums=2)
-    def gait(length, scale, with_slope):
+    @jax.jit
+    def gait(length, scale):
+        """Return the speed with its slopes, and the angles with the derivative of the map: one program."""
         args = PROBLEM.args._replace(leg_length=length, center=scale)
         move = lambda angles, args: step(angles, args)[0] - angles
         start = jnp.array(FIXED_POINT) + 1e-3
@@ -94,22 +93,20 @@ def test_speed_of_the_designed_gait():
         def speed(length, scale):
             args = PROBLEM.args._replace(leg_length=length, center=scale)
             angles = optx.root_find(move, solver, start, args).value
-            return step(angles, args)[1], angles
+            value = step(angles, args)[1]
+            return value, (value, angles)
 
-        if not with_slope:
-            return speed(length, scale)
-        slopes = jax.jacfwd(lambda p: speed(*p)[0])((length, scale))
-        angles = speed(length, scale)[1]
-        return slopes, angles, jax.jacfwd(lambda x: step(x, args)[0])(angles)
+        slopes, (value, angles) = jax.jacfwd(lambda p: speed(*p), has_aux=True)((length, scale))
+        return value, slopes, angles, jax.jacfwd(lambda x: step(x, args)[0])(angles)
 
     one = jnp.ones(())
-    (by_length, by_center), angles, jacobian = gait(one, one, True)
+    speed, (by_length, by_center), angles, jacobian = gait(one, one)
     np.testing.assert_allclose(angles, FIXED_POINT, atol=1e-10)
     sizes = np.sort(np.abs(np.linalg.eigvals(jacobian)))
     assert np.all(sizes[:2] < 1e-10)
     assert np.all((0.5 < sizes[2:]) & (sizes[2:] < 0.6))
-    speed, h = gait(one, one, False)[0], 1e-3
-    at = [gait(one + k * h, one, False)[0] for k in (-2, -1, 1, 2)]
+    h = 1e-3
+    at = [gait(one + k * h, one)[0] for k in (-2, -1, 1, 2)]
     quotient = (at[0] - 8 * at[1] + 8 * at[2] - at[3]) / (12 * h)
     np.testing.assert_allclose(by_length, quotient, rtol=1e-6)
     np.testing.assert_allclose(by_length + by_center, speed / 2, rtol=1e-8)

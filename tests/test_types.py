@@ -35,7 +35,7 @@ term = dfx.ODETerm(lambda t, y, args: y)
 RIGHT = [
     "assert_type(mj.project(rod, 0.0, y), tuple[State, mj.ProjectionInfo])",
     "assert_type(mj.consistent_state(rod, 0.0, y)[0], State)",
-    "assert_type(mj.diffeqsolve(term, hook, 0.0, 1.0, None, y), dfx.Solution)",
+    "assert_type(mj.diffeqsolve(term, hook, 0.0, 1.0, None, y), mj.Solution)",
     "mj.Projected(dfx.Tsit5(), rod, projection=mj.NewtonProjection(max_steps=1))",
 ]
 WRONG = [
@@ -44,6 +44,7 @@ WRONG = [
     "mj.Projected(rod, dfx.Tsit5())",
     "mj.Projected(dfx.Tsit5(), rod, max_steps=1)",
     "mj.diffeqsolve(term, hook, 0.0, 1.0, y)",
+    "mj.diffeqsolve(lambda t, y, args: y, hook, 0.0, 1.0, None, y)",
     "mj.diffeqsolve(term, hook, 0.0, 1.0, None, y, rtol=1e-6)",
     "mj.diffeqsolve(term, hook, 0.0, 1.0, None, y, consistent='yes')",
     "mj.NewtonProjection(max_steps='many')",

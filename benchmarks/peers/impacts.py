@@ -157,8 +157,8 @@ def reference(gravity: float) -> np.ndarray:
         lambda t, x: (x[1], -gravity * np.sin(x[0])),
         (np.pi / 2, 0.0),
         np.array([T1]),
-        lambda t, x: x[0] - angle,
-        lambda t, x: np.array([x[0], -RESTITUTION * x[1]]),
+        [lambda t, x: x[0] - angle],
+        lambda _, x: np.array([x[0], -RESTITUTION * x[1]]),
     )[0]
     sin, cos = np.sin(theta), np.cos(theta)
     return np.array([sin, -cos, rate * cos, rate * sin])
