@@ -400,8 +400,7 @@ def as_users_run_it(case):
 
 
 @pytest.mark.slow
-# One of each kind: a constraint, conserved quantities, a mechanism.
-@pytest.mark.parametrize("name", ["pendulum", "rigid-body", "slider-crank"])
+@pytest.mark.parametrize("name", fit_cases.ALL)
 def test_two_standard_errors_cover_the_truth(name):
     share, error_without_noise = as_users_run_it(name)
     assert min(share.values()) >= 0.85, share
