@@ -9,7 +9,7 @@ import griffe
 
 _ANY_PLACE = griffe.ParameterKind.positional_or_keyword
 _BY_NAME = griffe.ParameterKind.keyword_only
-_BASES = re.compile(r"equinox\.Module|typing\.NamedTuple|diffrax\.\w+")
+_BASES = re.compile(r"equinox\.Module|typing\.NamedTuple|diffrax\.Abstract\w+")
 _NO_FIELD = re.compile(r"\b(ClassVar$|AbstractVar\[|AbstractClassVar\[)")
 
 
