@@ -61,7 +61,7 @@ class EquationsOfMotion:
         self.unravel, self.redundant = here.unravel, system.redundant
         self.C, self.num_positions = self.here.rows()
         self.bias = self.here.acceleration_bias()
-        self.force = _flat_force(system.force(t, *y, args), state[0], here.x)
+        self.force = flat_force(system.force(t, *y, args), state[0], here.x)
         self.mass = self.here.mass(self.C)
         self.directions = directions_of(self.mass, self.C)
         if isinstance(self.C, AbstractRows):
@@ -127,7 +127,7 @@ def _agree(C: Float[Array, "m n"], a: Float[Array, " n"], bias: Float[Array, " m
     return jnp.all(jnp.abs(C @ a + bias) <= _LARGEST_RESIDUAL * (own + 0.02 * largest))
 
 
-def _flat_force(force: Any, q: Y, x: Float[Array, " n"]) -> Float[Array, " n"]:
+def flat_force(force: Any, q: Y, x: Float[Array, " n"]) -> Float[Array, " n"]:
     if not are_alike(force, q):
         raise ValueError(
             f"`force` must return Q(t, q, v, args) of the structure and shapes of q, {shapes(q)}, got {shapes(force)}."

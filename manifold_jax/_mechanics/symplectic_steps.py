@@ -28,7 +28,7 @@ from .._linalg.rows import combine, directions_of
 from .._solver.base import AbstractOneStepSolver
 from .._solver.projected import Projected
 from .kinematics import flat, Kinematics
-from .motion import _flat_force
+from .motion import flat_force
 from .system import MechanicalSystem
 
 
@@ -116,7 +116,7 @@ class RATTLESteps(AbstractOneStepSolver):
         mass = kinematics.mass(J)
         normals = ConstraintNormals(J, directions_of(mass, J))
         factored = FactoredGram.of(normals, self.system.redundant)
-        force = _flat_force(self.system.force(t, *y, args), y[0], x)
+        force = flat_force(self.system.force(t, *y, args), y[0], x)
         return _Here(mass.solve(force), factored, mass.valid & factored.factorization.usable)
 
     def _step(
@@ -151,7 +151,7 @@ def _check_separable(system: MechanicalSystem, t: Any, y: Y, args: Args) -> None
 
     def forces(w: Float[Array, " k"]) -> Array:
         q, v = here.unravel(here.x), here.unravel(w)
-        return _flat_force(system.force(here.t, q, v, args), q, w)
+        return flat_force(system.force(here.t, q, v, args), q, w)
 
     if _depends(masses, here.x):
         raise ValueError(
