@@ -14,8 +14,8 @@ Function = TypeVar("Function", bound=Callable)
 
 def clear_errors(function: Function) -> Function:
     """Wrap a function made by `equinox.filter_jit`. The message of an error comes first, where a log
-    keeps it, and last, where a terminal shows it; a call with wrong arguments is told the signature; for an ensemble differentiated in
-    forward mode the message says what to write."""
+    keeps it, and last, where a terminal shows it; a call with wrong arguments is told the signature;
+    for an ensemble differentiated in forward mode the message says what to write."""
     signature, name = inspect.signature(function), getattr(function, "__name__", "")
 
     @functools.wraps(function)

@@ -201,9 +201,7 @@ class MechanicalHermite(dfx.AbstractLocalInterpolation):
         return tuple(jtu.tree_map(part, q0, q1, v0, v1) for part in (position, velocity))
 
 
-def rattle(
-    system: MechanicalSystem, *, order: Order = 2, projection: NewtonProjection | None = None
-) -> Projected:
+def rattle(system: MechanicalSystem, *, order: Order = 2) -> Projected:
     r"""RATTLE as a solver for [`diffeqsolve`][], for long times: symplectic and time-reversible, so that the
     error of the energy stays bounded for as long as the steps are all of one length.
 
@@ -221,10 +219,11 @@ def rattle(
 
     **Arguments:**
 
-    - `system`: with constant masses, forces that depend on time and positions only, and constraints on
-        positions; all of them may depend on `args`.
+    - `system`: that of the terms that are solved. Steps are made from its masses, forces and constraints and do
+        not evaluate the `terms`: a force that is in these alone has no effect. With constant masses,
+        forces that depend on time and positions only, and constraints on positions; all of them may
+        depend on `args`.
     - `order`: 2, or compositions of such steps of order 4 (five of them, Suzuki) or 6 (nine, Kahan & Li).
-    - `projection`: as for [`Projected`][].
 
     **Returns:**
 
@@ -258,5 +257,4 @@ def rattle(
             "`system` has auxiliary states, which RATTLE does not take. Use `mj.Projected(diffrax.Dopri8(), "
             "system.constraint)`."
         )
-    projection = NewtonProjection() if projection is None else projection
-    return Projected(RATTLESteps(system, order), system.constraint, projection=projection)
+    return Projected(RATTLESteps(system, order), system.constraint)

@@ -14,7 +14,7 @@ from .loads import AbstractLoads, LineLoads
 
 
 # Right and up in the picture of a mechanism in space, seen from the front and a little from above.
-_VIEW = np.array([[0.94, 0.17], [-0.34, 0.47], [0.0, 0.87]])
+VIEW = np.array([[0.94, 0.17], [-0.34, 0.47], [0.0, 0.87]])
 _COLORS = [f"C{i}" for i in range(10)]
 _RATE = 20  # pictures per second
 
@@ -38,7 +38,7 @@ def outline_of(assembly: Any, y: Any, markers: Mapping[str, tuple[str, Any]] | N
         q = q[None]
     placed = Placed.of(jax.vmap(with_ground)(q))
     origin, rotation = map(np.asarray, placed)
-    seen = (lambda x: x[..., :2]) if assembly.bodies.planar else (lambda x: x @ _VIEW)
+    seen = (lambda x: x[..., :2]) if assembly.bodies.planar else (lambda x: x @ VIEW)
     at = lambda body, local: origin[:, body] + rotation[:, body] @ np.asarray(local)
     rods, springs = [], []
     points: list[list[np.ndarray]] = [[] for _ in range(origin.shape[1])]

@@ -3,17 +3,14 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from ..._multibody.picture import VIEW
 from ...problems.delta_robot import DIRECTIONS, SPREAD
 from ...problems.stewart_platform import AT_BASE, AT_PLATFORM, CENTER
 from .motion import DrawnMotion, Lines
 
 
-# Columns are the directions to the right and upwards in the picture.
-_VIEW = np.array([[0.94, 0.17], [-0.34, 0.47], [0.0, 0.87]])
-
-
 def _seen(*lines: np.ndarray) -> Lines:
-    return [line @ _VIEW for line in lines]
+    return [line @ VIEW for line in lines]
 
 
 def _between(*points: np.ndarray) -> np.ndarray:
