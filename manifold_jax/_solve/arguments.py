@@ -1,10 +1,7 @@
 """Checks of the arguments of `mj.diffeqsolve`; messages say what to write instead."""
 
-import functools
-import inspect
 import warnings
-from collections.abc import Callable
-from typing import Any, cast, TypeVar
+from typing import Any
 
 import diffrax as dfx
 import equinox as eqx
@@ -23,7 +20,7 @@ from .._solver.stabilization import is_stable, stability_interval
 from .._solver.terms import DirectedTerm
 
 
-Function = TypeVar("Function", bound=Callable)
+_OWN_FIELDS = ("manifold_jax._mechanics", "manifold_jax._dae")
 
 
 def check_arguments(
@@ -75,48 +72,21 @@ def check_max_steps(max_steps: Any) -> None:
     )
 
 
-def explained(function: Function) -> Function:
-    """Wrap a solve: explain errors in it that come from a vector field unlike the state."""
-    signature = inspect.signature(function)
-
-    @functools.wraps(function)
-    def solve(*args: Any, **kwargs: Any) -> Any:
-        __tracebackhide__ = True
-        try:
-            return function(*args, **kwargs)
-        except (TypeError, ValueError) as error:
-            given = signature.bind(*args, **kwargs).arguments
-            fault = fault_of_field(*(given.get(name) for name in ("terms", "t0", "y0", "args")))
-            if fault is None:
-                raise
-            raise ValueError(fault) from error
-
-    return cast(Function, solve)
-
-
 def check_field(terms: Any, t0: Any, y0: Any, args: Any) -> None:
-    """Refuse a user's vector field of another shape than the state, which might be broadcast. Those that
-    this library makes have its shape, and take long to trace."""
-    function = getattr(terms, "vector_field", None)
-    if (getattr(function, "__module__", None) or "").startswith("manifold_jax."):
+    """Refuse a vector field of another shape than the state, which might be broadcast. Those of mechanical
+    systems and reduced DAEs have its shape, and take long to trace."""
+    module = getattr(getattr(terms, "vector_field", None), "__module__", None) or ""
+    if not isinstance(terms, dfx.ODETerm) or module.startswith(_OWN_FIELDS):
         return
-    if fault := fault_of_field(terms, t0, y0, args):
-        raise ValueError(fault)
-
-
-def fault_of_field(terms: Any, t0: Any, y0: Any, args: Any) -> str | None:
-    """Return the message for a vector field of another shape than the state."""
-    if not isinstance(terms, dfx.ODETerm):
-        return None
     try:
         field = eqx.filter_eval_shape(terms.vector_field, t0, y0, args)
-    except Exception:  # the error itself
-        return None
+    except Exception:  # raised again, with its place, where the solve evaluates it
+        return
     shapes = [[jnp.shape(leaf) for leaf in jtu.tree_leaves(tree)] for tree in (field, y0)]
     if jtu.tree_structure(field) != jtu.tree_structure(y0) or shapes[0] == shapes[1]:
-        return None  # Diffrax reports other structures
+        return  # Diffrax reports other structures
     got, state = (jtu.tree_map(jnp.shape, tree) for tree in (field, y0))
-    return (
+    raise ValueError(
         f"The vector field in `terms` must be like the state, of shape {state}, but returns {got}: one velocity for "
         "every number of `y`."
     )

@@ -17,7 +17,6 @@ from .arguments import (
     check_arguments,
     check_field,
     check_max_steps,
-    explained,
     raise_if_unstable,
     warn_of_rounding,
     warn_of_unknown_hook,
@@ -38,7 +37,6 @@ from .times import checking_first_step, refusing_missing_times
 @numbers_as_arrays("y0", "args", times=("t0", "t1", "dt0"))
 @eqx.filter_jit
 @refusing_missing_times
-@explained
 def diffeqsolve(
     terms: Terms,
     solver: dfx.AbstractSolver,

@@ -19,7 +19,6 @@ from ..._resets.reset import check_resets
 from ..._solve.arguments import (
     check_arguments,
     check_field,
-    fault_of_field,
     warn_of_rounding,
     without_idle_hook,
 )
@@ -151,8 +150,6 @@ def solve_ensemble(
         try:
             solution = solve_on_one_device(Inputs(equations, batch))
         except Exception as error:
-            if fault := fault_of_field(equations.terms, one.t0, one.y0, one.args):
-                raise ValueError(fault) from error
             error.add_note(_example(batch))
             raise
         solution = dataclasses.replace(solution, messages=messages_of(solver, bool(resets)))
