@@ -8,6 +8,7 @@ that are there to be large, and those that have jumps.
 from collections.abc import Callable
 
 from ._problem import Problem as Problem
+from .battery import battery as battery
 from .cable_net import cable_net as cable_net
 from .car_axis import car_axis as car_axis
 from .chain import chain as chain, double_pendulum as double_pendulum
@@ -25,8 +26,10 @@ from .oscillator import harmonic_oscillator as harmonic_oscillator
 from .parallelogram import parallelogram as parallelogram
 from .pendulum import pendulum as pendulum, spherical_pendulum as spherical_pendulum
 from .polymer import polymer as polymer
+from .relay_feedback import relay_feedback as relay_feedback
 from .rigid_body import rigid_body as rigid_body
 from .rolling_disc import rolling_disc as rolling_disc
+from .rotating_hoop import rotating_hoop as rotating_hoop
 from .slider_crank import slider_crank as slider_crank
 from .small_daes import arevalo as arevalo, jay2 as jay2, skate as skate
 from .stewart_platform import stewart_platform as stewart_platform
@@ -42,5 +45,5 @@ ALL = _named(
     spherical_pendulum, heavy_top, rolling_disc,
 )  # fmt: skip
 FURTHER = _named(
-    compass_gait, newtons_cradle, delta_robot, stewart_platform, n_four_bar, cable_net, falling_truss, polymer,
+    compass_gait, newtons_cradle, rotating_hoop, relay_feedback, battery, delta_robot, stewart_platform, n_four_bar, cable_net, falling_truss, polymer,
 )  # fmt: skip
