@@ -45,5 +45,6 @@ ALL = _named(
     spherical_pendulum, heavy_top, rolling_disc,
 )  # fmt: skip
 FURTHER = _named(
-    compass_gait, newtons_cradle, rotating_hoop, relay_feedback, battery, delta_robot, stewart_platform, n_four_bar, cable_net, falling_truss, polymer,
+    compass_gait, newtons_cradle, rotating_hoop, relay_feedback, battery, delta_robot, stewart_platform, n_four_bar,
+    cable_net, falling_truss, polymer,
 )  # fmt: skip

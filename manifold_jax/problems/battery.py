@@ -6,6 +6,7 @@ import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
+
 from .._base.types import FloatScalar, RealScalarLike
 from .._constraint.constraint import Constraint
 from .._resets.reset import Reset
@@ -58,9 +59,7 @@ def _circuit(t: RealScalarLike, y: BatteryState, args: BatteryArgs) -> FloatScal
     """What the mode prescribes: the current, or the voltage."""
     prescribed = jnp.where(y.mode == LOAD, -args.load, args.charging)
     holds_voltage = y.mode == CONSTANT_VOLTAGE
-    return jnp.where(
-        holds_voltage, terminal_voltage(y, args) - args.upper, y.current - prescribed
-    )
+    return jnp.where(holds_voltage, terminal_voltage(y, args) - args.upper, y.current - prescribed)
 
 
 def _field(t: RealScalarLike, y: BatteryState, args: BatteryArgs) -> BatteryState:
@@ -125,7 +124,9 @@ def _exact(t: np.ndarray, args: BatteryArgs, y0: Any) -> BatteryState:
     def current(x: np.ndarray) -> Any:
         at_voltage = (args.upper - inside(x)) / args.series
         mode = x[..., 3]
-        return np.where(mode == LOAD, -load, np.where(mode == CONSTANT_CURRENT, charging, at_voltage))
+        return np.where(
+            mode == LOAD, -load, np.where(mode == CONSTANT_CURRENT, charging, at_voltage)
+        )
 
     def field(t: float, x: np.ndarray) -> np.ndarray:
         i = current(x)
@@ -142,7 +143,7 @@ def _exact(t: np.ndarray, args: BatteryArgs, y0: Any) -> BatteryState:
         in_mode(CONSTANT_VOLTAGE, lambda x: current(x) - args.final),
     ]
     following = [CONSTANT_CURRENT, CONSTANT_VOLTAGE, LOAD]
-    start = [y0.charge, *y0.relaxation, y0.mode]
+    start = np.array([y0.charge, *y0.relaxation, y0.mode])
     jump = lambda i, x: np.array([*x[:3], following[i]])
     x = integrate_with_resets(field, start, t, conditions, jump)
     return BatteryState(x[:, 0], x[:, 1:3], current(x), x[:, 3])
@@ -198,7 +199,7 @@ def battery(
     their equation 2, and its resistances and capacitances as the constants that they are above a fifth of
     the charge.
     """
-    pair = " one for each RC element"
+    pair = ", one for each RC element"
     resistances = repeated(resistances, 2, "resistances", pair)
     capacitances = repeated(capacitances, 2, "capacitances", pair)
     circuit = series, capacity, load, charging, final, lower, upper
