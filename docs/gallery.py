@@ -15,6 +15,7 @@ from matplotlib.figure import Figure
 import manifold_jax as mj
 from manifold_jax._tools.animate import DrawnMotion, SKETCHES
 from manifold_jax._tools.compare.task import as_rows
+from manifold_jax.problems.battery import terminal_voltage
 
 
 FOLDER = Path(__file__).parent / "pages" / "gallery"
@@ -23,7 +24,7 @@ SMALLER = {"n-four-bar": lambda: mj.problems.n_four_bar(4)}
 # Mechanisms are shown at the start and until this time, in seconds; these longer.
 UNTIL, LONGER = (
     0.6,
-    {"compass-gait": 12.0, "falling-truss": 2.0, "slider-crank": 4.0, "newtons-cradle": 0.9},
+    {"compass-gait": 12.0, "falling-truss": 2.0, "slider-crank": 4.0, "newtons-cradle": 0.9, "rotating-hoop": 0.3},
 )
 BLUE = "#0072B2"
 
@@ -76,10 +77,25 @@ def draw_mechanism(figure: Figure, problem: mj.problems.Problem) -> None:
     ax.set_axis_off()
 
 
+def angle_and_rate(y: Any, args: Any) -> np.ndarray:
+    (c, s), (dc, ds) = np.moveaxis(y[0], 1, 0), np.moveaxis(y[1], 1, 0)
+    return np.stack([np.arctan2(s, c), c * ds - s * dc], axis=1)
+
+
+def voltage(y: Any, args: Any) -> np.ndarray:
+    return np.asarray(jax.vmap(lambda y: terminal_voltage(y, args))(y))[:, None]
+
+
+# What is drawn instead of the first array of the state.
+VIEWS = {"relay-feedback": angle_and_rate, "battery": voltage}
+
+
 def draw_states(figure: Figure, problem: mj.problems.Problem) -> None:
     """Draw the first array of the state as a curve, or its components over time."""
     times = np.linspace(problem.t0, problem.t1, 600)
-    rows = as_rows(jtu.tree_leaves(solution(problem, times)[0])[:1])
+    states = solution(problem, times)[0]
+    first = as_rows(jtu.tree_leaves(states)[:1])
+    rows = VIEWS[problem.name](states, problem.args) if problem.name in VIEWS else first
     if rows.shape[1] in (2, 3):
         is_spatial = rows.shape[1] == 3
         ax: Axes = figure.add_subplot(projection="3d" if is_spatial else None)

@@ -209,8 +209,10 @@ def test_battery():
 
 @pytest.mark.slow
 def test_gradients_of_the_battery():
-    """Through four switches."""
-    check_gradient(BATTERY, lambda y: y.charge + y.relaxation[1])
+    """Through all three kinds of switches."""
+    problem = mj.problems.battery(charge=0.35, final=0.4, t1=3300.0)
+    assert problem.reference(problem.t1).mode == 0.0
+    check_gradient(problem, lambda y: y.charge + y.relaxation[1])
 
 
 def test_bad_input():

@@ -16,6 +16,7 @@ SKETCHES: dict[str, Sketch] = {
     "newtons-cradle": planar.sketch_newtons_cradle,
     "compass-gait": planar.sketch_compass_gait,
     "spherical-pendulum": spatial.sketch_rod,
+    "rotating-hoop": spatial.sketch_rotating_hoop,
     "polymer": spatial.sketch_beads,
     "cable-net": spatial.sketch_cable_net,
     "delta-robot": spatial.sketch_delta_robot,

@@ -1,5 +1,7 @@
 """Sketches of the mechanisms in space, seen from the front and a little from above."""
 
+from typing import Any
+
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -31,6 +33,21 @@ def _carried(motion: DrawnMotion, body: int, local: np.ndarray) -> np.ndarray:
 
 def sketch_rod(motion: DrawnMotion) -> Lines:
     return _seen(_between(np.zeros(3), motion.q))
+
+
+def sketch_rotating_hoop(motion: DrawnMotion) -> Lines:
+    """Draw the hoop, its stop, and the bead as a small ring."""
+    R, turned = float(motion.args.radius), float(motion.args.rate) * motion.times
+    outwards = np.stack([np.cos(turned), np.sin(turned), 0 * turned], axis=1)[:, None]
+
+    def on_hoop(angles: Any, radius: Any) -> np.ndarray:
+        sin, cos = (np.reshape(radius * f(angles), (-1, 1)) for f in (np.sin, np.cos))
+        return sin * outwards - cos * np.array([0.0, 0.0, 1.0])
+
+    tick = on_hoop(float(motion.args.stop), R * np.array([0.88, 1.12]))
+    around = np.linspace(0, 2 * np.pi, 33)
+    ring = 0.04 * R * np.stack([np.cos(around[::4]), np.sin(around[::4])], axis=1)
+    return [*_seen(on_hoop(around, R), tick), (motion.q @ VIEW)[:, None] + ring]
 
 
 def sketch_beads(motion: DrawnMotion) -> Lines:

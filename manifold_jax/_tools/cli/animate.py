@@ -20,7 +20,7 @@ def animate(
             metavar="PROBLEM",
             help="A mechanism of the gallery: pendulum, double-pendulum, chain, slider-crank, "
             "four-bar, n-four-bar, parallelogram, falling-truss, compass-gait, newtons-cradle, spherical-pendulum, "
-            "polymer, cable-net, delta-robot, stewart-platform.",
+            "rotating-hoop, polymer, cable-net, delta-robot, stewart-platform.",
         ),
     ],
     out: Annotated[Path, typer.Option(metavar="FILE", help="The picture to write (gif).")],
