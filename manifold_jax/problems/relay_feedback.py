@@ -22,7 +22,7 @@ class RelayFeedbackArgs(NamedTuple):
 
     inertia: Any = 100.0
     torque: Any = 5.0
-    lead: Any = 2.0
+    lead: Any = 1.8
     hysteresis: Any = 0.1
 
 
@@ -93,7 +93,7 @@ def relay_feedback(
     *,
     inertia: Any = 100.0,
     torque: Any = 5.0,
-    lead: Any = 2.0,
+    lead: Any = 1.8,
     hysteresis: Any = 0.1,
     angle: Any = 0.5,
     rate: Any = 0.0,
