@@ -24,7 +24,13 @@ SMALLER = {"n-four-bar": lambda: mj.problems.n_four_bar(4)}
 # Mechanisms are shown at the start and until this time, in seconds; these longer.
 UNTIL, LONGER = (
     0.6,
-    {"compass-gait": 12.0, "falling-truss": 2.0, "slider-crank": 4.0, "newtons-cradle": 0.9, "rotating-hoop": 0.3},
+    {
+        "compass-gait": 12.0,
+        "falling-truss": 2.0,
+        "slider-crank": 4.0,
+        "newtons-cradle": 0.9,
+        "rotating-hoop": 0.3,
+    },
 )
 BLUE = "#0072B2"
 

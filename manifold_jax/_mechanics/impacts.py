@@ -43,7 +43,8 @@ def impact(
     - `system`: the mechanical system that is solved.
     - `gap`: `gap(t, q, args)`, a real number that is positive where there is no contact.
     - `restitution`: `e` between 0 (plastic) and 1 (elastic), a number or a function of `args`. After a
-        plastic impact the gap stays closed: solve on with a system that has it as a constraint.
+        plastic impact the gap stays closed: write a constraint that a [`Reset`][] switches on instead, as the page
+        on resets does.
     - `samples`, `max_number`: as for [`Reset`][].
 
     **Returns:**
