@@ -65,6 +65,16 @@ def test_robots_are_closed_where_the_constraint_holds():
         np.testing.assert_allclose(*[rod[1] - rod[0] for rod in rods], atol=1e-12)
 
 
+def test_the_bead_is_on_the_hoop():
+    (hoop, stop, bead), args = lines_of("rotating-hoop")
+    at = lambda angle: (
+        np.cos(angle) * hoop[0] + np.sin(angle) * hoop[8]
+    )  # an ellipse by its conjugate radii
+    np.testing.assert_allclose(hoop, [at(a) for a in np.linspace(0, 2 * np.pi, 33)], atol=1e-12)
+    np.testing.assert_allclose(bead[:-1].mean(axis=0), at(0.4), atol=1e-12)
+    np.testing.assert_allclose(stop.mean(axis=0), at(float(args.stop)), atol=1e-12)
+
+
 def test_the_hip_of_a_walker_does_not_jump():
     problem = mj.problems.compass_gait()
     before = problem.reference(3.88)
