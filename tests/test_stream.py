@@ -331,6 +331,20 @@ def test_command(tmp_path):
 
 
 @pytest.mark.slow
+def test_command_for_a_problem_with_resets(tmp_path):
+    """Each trajectory switches at the times of its own parameters."""
+    arguments = ["--size", 20, "--t1", 5, "--rtol", 1e-9, "--atol", 1e-9, "--out", tmp_path / "out"]
+    result = run("ensemble", "relay-feedback", "--vary", "args.lead=uniform(1.5,2)", *arguments)
+    assert result.exit_code == 0, result.output
+    ys = mj.open_ensemble(tmp_path / "out").ys
+    problem = mj.problems.relay_feedback()
+    for i, lead in enumerate(ys["varied/args.lead"][:].ravel()):
+        known = problem.with_args(problem.args._replace(lead=lead)).reference(5.0)
+        for k in range(3):
+            np.testing.assert_allclose(ys[f"y/{k}"][i, 0], known[k], atol=1e-7)
+
+
+@pytest.mark.slow
 def test_command_reports_failures(tmp_path):
     """Of starts so far away that their squares are infinite."""
     arguments = [*PENDULUM, "--vary", "args.gravity=uniform(9,10)", "--vary"]

@@ -83,7 +83,7 @@ def ensemble(
             saveat=dfx.SaveAt(t1=True, fn=varied.saved),
             stepsize_controller=dfx.PIDController(rtol=rtol, atol=atol),
             max_steps=2**20,
-            resets=task.problem.resets,
+            resets=varied.resets,
             lanes=lanes,
             chunk=chunk,
             seed=seed,

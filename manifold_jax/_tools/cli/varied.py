@@ -1,5 +1,6 @@
 """Problems of the gallery with some of their numbers drawn at random."""
 
+import dataclasses
 import math
 import re
 from typing import Any, NamedTuple
@@ -15,6 +16,7 @@ import typer
 from jaxtyping import Array
 
 from ..._constraint.constraint import AbstractConstraint
+from ..._resets.reset import Reset, ResetAt
 from ...problems import Problem
 from .arguments import check_name
 
@@ -111,6 +113,7 @@ class VariedProblem:
         self.constraint = ConstraintInArgs(
             template=problem.constraint, redundant=problem.constraint.redundant
         )
+        self.resets = tuple(_for_drawn_args(reset) for reset in problem.resets)
 
     def __repr__(self) -> str:
         """Show the problem as the settings of the folder have it."""
@@ -161,6 +164,19 @@ class ConstraintInArgs(AbstractConstraint):
 
     def faults(self, t: Any, y: Any, args: Any = None) -> Any:
         return self._of(args).faults(t, y, args.args)
+
+
+def _for_drawn_args(reset: Reset | ResetAt) -> Reset | ResetAt:
+    """Return the reset with functions of the [`DrawnArgs`][] of each trajectory."""
+
+    def jump(t: Any, y: Any, given: DrawnArgs) -> Any:
+        return reset.jump(t, y, given.args)
+
+    if isinstance(reset, Reset):
+        condition = lambda t, y, given: reset.condition(t, y, given.args)
+        return dataclasses.replace(reset, condition=condition, jump=jump)
+    times = reset.times
+    return ResetAt((lambda given: times(given.args)) if callable(times) else times, jump)
 
 
 def _names_in(name: str, tree: Any) -> list[str]:
