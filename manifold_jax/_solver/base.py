@@ -22,16 +22,10 @@ from .step.frame import StepFrame
 from .step.hook_state import conclude, HookState
 
 
-class AbstractOneStepSolver(dfx.AbstractSolver):
-    """A solver that is no Runge-Kutta method of Diffrax, whose step depends on the state at its start
-    alone: it has no `solver_state`."""
-
-
 # One-step methods that keep no past values of y. Others (leapfrog, reversible) carry a
 # shadow trajectory in their state that would not be moved onto the manifold.
 _SUPPORTED = (
     dfx.AbstractRungeKutta,
-    AbstractOneStepSolver,
     dfx.AbstractSRK,
     dfx.Euler,
     dfx.ImplicitEuler,

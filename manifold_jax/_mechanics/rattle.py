@@ -1,0 +1,92 @@
+"""RATTLE: symplectic, time-reversible steps of mechanical systems, and compositions of them."""
+
+from typing import Any, ClassVar
+
+import diffrax as dfx
+import jax.numpy as jnp
+
+from .._base.types import Args, RealScalarLike, Y
+from .._constraint.constraint import AbstractConstraint
+from .._constraint.projection_info import ProjectionInfo
+from .._constraint.settings import NewtonProjection
+from .._solver import AbstractManifoldSolver, StepFrame
+from .symplectic_steps import COMPOSITIONS, Order, RATTLESteps
+from .system import MechanicalSystem
+
+
+class RATTLE(AbstractManifoldSolver):
+    """A hook around steps that end on the manifold by themselves: a correction would add its own rounding
+    errors, which no later step takes back."""
+
+    inner: dfx.AbstractSolver
+    constraint: AbstractConstraint
+    projection: NewtonProjection = NewtonProjection()
+    corrects_output: ClassVar[bool] = True
+
+    def prepare_terms(self, terms: Any) -> Any:
+        return terms
+
+    def frame(
+        self, terms: Any, t0: RealScalarLike, t1: RealScalarLike, y0: Y, args: Args
+    ) -> StepFrame:
+        unchanged = lambda y: (y, ProjectionInfo.of_nothing(y, jnp.asarray(True)))
+        return StepFrame.of_state(y0, terms, unchanged)
+
+
+def rattle(system: MechanicalSystem, *, order: Order = 2) -> "RATTLE":
+    r"""RATTLE as a solver for [`diffeqsolve`][], for long times: symplectic and time-reversible, so that the
+    error of the energy stays bounded for as long as the steps are all of one length.
+
+    A step of length `h` of `M v' = Q(t, q) - J^T lambda`, `phi(t, q) = 0`, with constant masses `M`:
+
+    $$v_{1/2} = v_0 + \tfrac h2 M^{-1} (Q(q_0) - J(q_0)^T \lambda), \quad q_1 = q_0 + h\, v_{1/2}, \quad
+    \phi(q_1) = 0,$$
+
+    $$v_1 = v_{1/2} + \tfrac h2 M^{-1} (Q(q_1) - J(q_1)^T \mu), \quad \dot\phi(q_1, v_1) = 0.$$
+
+    ```python
+    solver = mj.rattle(system)
+    sol = mj.diffeqsolve(system.terms, solver, 0.0, 1000.0, 0.01, y0, args, max_steps=None)
+    ```
+
+    **Arguments:**
+
+    - `system`: that of the terms that are solved. Steps are made from its masses, forces and constraints and do
+        not evaluate the `terms`: a force that is in these alone has no effect. With constant masses,
+        forces that depend on time and positions only, and constraints on positions; all of them may
+        depend on `args`.
+    - `order`: 2, or compositions of such steps of order 4 (five of them, Suzuki) or 6 (nine, Kahan & Li).
+
+    **Returns:**
+
+    A [`Projected`][] hook around these steps: gradients, events, resets, ensembles and saved values are as
+    for every other. Dense output is of third order between the steps. Steps have a constant size.
+
+    **Raises:**
+
+    `TypeError` for another system, `ValueError` for another order or constraints on velocities; when it is
+    solved, `ValueError` for forces that depend on velocities and masses that depend on positions.
+
+    Prefer an explicit method of high order for short times at tight tolerances.
+
+    Sources: Andersen, J. Comput. Phys. 52 (1983) 24-34; Hairer, Lubich & Wanner, Geometric Numerical
+    Integration (2006), sections VII.1.4 and V.3.
+    """
+    if not isinstance(system, MechanicalSystem):
+        raise TypeError(
+            f"`system` must be an `mj.MechanicalSystem`, got {type(system).__name__}. Of an assembly of `mj.multibody` "
+            "pass its `system`."
+        )
+    if order not in COMPOSITIONS:
+        raise ValueError(f"`order` must be 2, 4 or 6, got {order!r}.")
+    if system.nonholonomic is not None or system.holonomic is None:
+        raise ValueError(
+            "`system` has constraints on velocities, which RATTLE has no symplectic steps for. Use "
+            "`mj.Projected(diffrax.Dopri8(), system.constraint)`."
+        )
+    if system.auxiliary is not None:
+        raise ValueError(
+            "`system` has auxiliary states, which RATTLE does not take. Use `mj.Projected(diffrax.Dopri8(), "
+            "system.constraint)`."
+        )
+    return RATTLE(RATTLESteps(system, order), system.constraint)
