@@ -31,6 +31,10 @@ class Compensated(NamedTuple):
         rest = (self.value - (value - added)) + (increment - added)
         return Compensated(value, lax.stop_gradient(rest))
 
+    def moved(self, h: FloatScalar, velocity: "Compensated") -> "Compensated":
+        """Add `h * velocity`."""
+        return self.plus(h * velocity.value + h * velocity.rest)
+
 
 # Differences of times that agree to so many units of rounding of the later one are the same.
 _SAME = 4

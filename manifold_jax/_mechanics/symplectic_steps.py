@@ -149,8 +149,8 @@ class RATTLESteps(dfx.AbstractSolver):
         """Make one step of second order."""
         t, x, w, here, success = start
         after = t + h
-        move = h * (w.value + 0.5 * h * here.free) + h * w.rest
-        free = x.plus(move).value
+        half = w.plus(0.5 * h * here.free)
+        free = x.moved(h, half).value
         system, directions = self.system, here.factored.normals.directions
         residual = Kinematics.of(system, t, (unravel(free), unravel(w.value)), args).position
         residual = convert_closure(residual, after, free, args)
@@ -158,14 +158,13 @@ class RATTLESteps(dfx.AbstractSolver):
             residual, after, free, args, None, directions, system.redundant
         )
         root = solve_correction(equations, free, NewtonProjection(), False, here.factored)
-        pull = combine(jnp.where(root.success, root.z, 0), directions)
-        x = x.plus(move + pull)
+        half = half.plus(combine(jnp.where(root.success, root.z, 0), directions) / h)
+        x = x.moved(h, half)
         there = self._here(after, x.value, w.value, unravel, args)
-        kick = pull / h + 0.5 * h * (here.free + there.free)
-        unconstrained = w.plus(kick).value
-        kinematics = Kinematics.of(system, after, (unravel(x.value), unravel(unconstrained)), args)
+        w = half.plus(0.5 * h * there.free)
+        kinematics = Kinematics.of(system, after, (unravel(x.value), unravel(w.value)), args)
         impulse = there.factored.solve(kinematics.velocities())
-        w = w.plus(kick - combine(impulse, there.factored.normals.directions))
+        w = w.plus(-combine(impulse, there.factored.normals.directions))
         return _Point(after, x, w, there, success & root.success & there.usable)
 
 
