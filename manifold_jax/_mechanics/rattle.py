@@ -33,7 +33,7 @@ class RATTLE(AbstractManifoldSolver):
         return StepFrame.of_state(y0, terms, unchanged)
 
 
-def rattle(system: MechanicalSystem, *, order: Order = 2) -> "RATTLE":
+def rattle(system: MechanicalSystem, *, order: Order = 2) -> RATTLE:
     r"""RATTLE as a solver for [`diffeqsolve`][], for long times: symplectic and time-reversible, so that the
     error of the energy stays bounded for as long as the steps are all of one length.
 
@@ -57,10 +57,13 @@ def rattle(system: MechanicalSystem, *, order: Order = 2) -> "RATTLE":
         depend on `args`.
     - `order`: 2, or compositions of such steps of order 4 (five of them, Suzuki) or 6 (nine, Kahan & Li).
 
+    Rounding errors of positions and velocities are carried from step to step (compensated summation), in
+    both precisions. States at the ends of steps are on the manifold to a few units of rounding.
+
     **Returns:**
 
-    A [`Projected`][] hook around these steps: gradients, events, resets, ensembles and saved values are as
-    for every other. Dense output is of third order between the steps. Steps have a constant size.
+    A solver whose gradients, events, resets, ensembles and saved values are as those of [`Projected`][].
+    Dense output is of third order between the steps. Steps have a constant size.
 
     **Raises:**
 
@@ -70,7 +73,7 @@ def rattle(system: MechanicalSystem, *, order: Order = 2) -> "RATTLE":
     Prefer an explicit method of high order for short times at tight tolerances.
 
     Sources: Andersen, J. Comput. Phys. 52 (1983) 24-34; Hairer, Lubich & Wanner, Geometric Numerical
-    Integration (2006), sections VII.1.4 and V.3.
+    Integration (2006), sections VII.1.4, V.3 and VIII.5.
     """
     if not isinstance(system, MechanicalSystem):
         raise TypeError(

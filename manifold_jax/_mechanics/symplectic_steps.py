@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 
 from .._base.closure import convert_closure
 from .._base.compat import nonlinear_failure, time_direction
-from .._base.compensated import Compensated, SteadySteps
+from .._base.compensated import Compensated
 from .._base.types import Args, BoolScalar, RealScalarLike, Y
 from .._constraint.correction import (
     ConstraintNormals,
@@ -65,21 +65,19 @@ class _Point(NamedTuple):
 
 
 class Rests(NamedTuple):
-    """The memory of the steps: what rounding has taken from positions and velocities, and their length."""
+    """The memory of the steps: what rounding has taken from positions and velocities."""
 
     x: Float[Array, " k"]
     w: Float[Array, " k"]
-    run: SteadySteps
 
 
 class RATTLESteps(dfx.AbstractSolver):
     """The steps of [`rattle`][], which has the formulas.
 
     Positions and velocities are sums of increments whose rounding errors are carried along, from step to
-    step in the state of the solver. What is left are those of the increments, smaller by the length of
-    a step. The multipliers enter as increments, too: they have rounding errors of `1 / h`, along normals, and
-    one step takes back what the one before has added. Differences of rounded positions would not have that
-    property.
+    step in the state of the solver. What is left are those of the increments, smaller by the length of a
+    step. The multipliers have errors of rounding size over `h`, along the normals: one step takes back what
+    the one before has added, if the velocity in the middle is the one by which positions move.
     """
 
     system: MechanicalSystem
@@ -96,7 +94,7 @@ class RATTLESteps(dfx.AbstractSolver):
 
     def init(self, terms, t0, t1, y0: Y, args: Args) -> Rests:
         x, w = flat(y0)
-        return Rests(jnp.zeros_like(x), jnp.zeros_like(w), SteadySteps.beginning(t0))
+        return Rests(jnp.zeros_like(x), jnp.zeros_like(w))
 
     def func(self, terms, t0, y0: Y, args: Args) -> Any:
         return terms.vf(t0, y0, args)
@@ -115,8 +113,7 @@ class RATTLESteps(dfx.AbstractSolver):
         x, w = flat(y0)
         unravel = jfu.ravel_pytree(y0[0])[1]
         direction = jnp.asarray(time_direction(terms), x.dtype)
-        length, run = solver_state.run.then(t0, t1)
-        length = length.astype(x.dtype) * direction
+        length = jnp.asarray(t1 - t0, x.dtype) * direction
         t = jnp.asarray(t0, x.dtype) * direction
         here = self._here(t, x, w, unravel, args)
         rests = Compensated(x, solver_state.x), Compensated(w, solver_state.w)
@@ -133,7 +130,7 @@ class RATTLESteps(dfx.AbstractSolver):
         y1 = unravel(end.x.value), unravel(end.w.value)
         result = RESULTS.where(end.success, RESULTS.successful, nonlinear_failure())
         dense_info = dict(y0=y0, y1=y1, length=length)
-        return y1, None, dense_info, Rests(end.x.rest, end.w.rest, run), result
+        return y1, None, dense_info, Rests(end.x.rest, end.w.rest), result
 
     def _here(self, t: Any, x: Any, w: Any, unravel: Callable, args: Args) -> _Here:
         y = unravel(x), unravel(w)
