@@ -47,6 +47,7 @@ from ._solver import (
     Projected as Projected,
     Stabilized as Stabilized,
     StepFrame as StepFrame,
+    SymmetricProjection as SymmetricProjection,
 )
 from ._solver.chart import (
     AbstractChart as AbstractChart,

@@ -1,36 +1,26 @@
 """RATTLE: symplectic, time-reversible steps of mechanical systems, and compositions of them."""
 
-from typing import Any, ClassVar
+from typing import Any
 
 import diffrax as dfx
-import jax.numpy as jnp
 
-from .._base.types import Args, RealScalarLike, Y
+from .._base.compositions import check_order, Order
 from .._constraint.constraint import AbstractConstraint
-from .._constraint.projection_info import ProjectionInfo
 from .._constraint.settings import NewtonProjection
-from .._solver import AbstractManifoldSolver, StepFrame
-from .symplectic_steps import COMPOSITIONS, Order, RATTLESteps
+from .._solver.on_manifold import AbstractStepsOnManifold
+from .symplectic_steps import RATTLESteps
 from .system import MechanicalSystem
 
 
-class RATTLE(AbstractManifoldSolver):
-    """A hook around steps that end on the manifold by themselves: a correction would add its own rounding
-    errors, which no later step takes back."""
+class RATTLE(AbstractStepsOnManifold):
+    """The hook around the steps."""
 
     inner: dfx.AbstractSolver
     constraint: AbstractConstraint
     projection: NewtonProjection = NewtonProjection()
-    corrects_output: ClassVar[bool] = True
 
     def prepare_terms(self, terms: Any) -> Any:
         return terms
-
-    def frame(
-        self, terms: Any, t0: RealScalarLike, t1: RealScalarLike, y0: Y, args: Args
-    ) -> StepFrame:
-        unchanged = lambda y: (y, ProjectionInfo.of_nothing(y, jnp.asarray(True)))
-        return StepFrame.of_state(y0, terms, unchanged)
 
 
 def rattle(system: MechanicalSystem, *, order: Order = 2) -> RATTLE:
@@ -80,8 +70,7 @@ def rattle(system: MechanicalSystem, *, order: Order = 2) -> RATTLE:
             f"`system` must be an `mj.MechanicalSystem`, got {type(system).__name__}. Of an assembly of `mj.multibody` "
             "pass its `system`."
         )
-    if order not in COMPOSITIONS:
-        raise ValueError(f"`order` must be 2, 4 or 6, got {order!r}.")
+    check_order(order)
     if system.nonholonomic is not None or system.holonomic is None:
         raise ValueError(
             "`system` has constraints on velocities, which RATTLE has no symplectic steps for. Use "

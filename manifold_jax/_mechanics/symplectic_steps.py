@@ -1,12 +1,11 @@
 """Steps of RATTLE and of its compositions."""
 
 from collections.abc import Callable
-from typing import Any, ClassVar, Literal, NamedTuple, TypeAlias
+from typing import Any, ClassVar, NamedTuple
 
 import diffrax as dfx
 import equinox as eqx
 import jax.flatten_util as jfu
-import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
@@ -16,6 +15,7 @@ from jaxtyping import Array, Float
 from .._base.closure import convert_closure
 from .._base.compat import nonlinear_failure, time_direction
 from .._base.compensated import Compensated
+from .._base.compositions import composed, Order
 from .._base.types import Args, BoolScalar, RealScalarLike, Y
 from .._constraint.correction import (
     ConstraintNormals,
@@ -30,19 +30,6 @@ from .hermite import MechanicalHermite
 from .kinematics import flat, Kinematics
 from .motion import flat_force
 from .system import MechanicalSystem
-
-
-Order: TypeAlias = Literal[2, 4, 6]
-
-_SUZUKI = 1 / (4 - 4 ** (1 / 3))
-# The lengths of the steps that make one. Sources: Suzuki, Phys. Lett. A 146 (1990) 319-323, and Kahan & Li,
-# Math. Comp. 66 (1997) 1089-1099 (nine stages), as in Hairer, Lubich & Wanner (2006), section V.3.
-_HALF = (0.39216144400731413928, 0.33259913678935943860, -0.70624617255763935981, 0.082213596293550800230)  # fmt: skip
-COMPOSITIONS: dict[int, tuple[float, ...]] = {
-    2: (1.0,),
-    4: (_SUZUKI, _SUZUKI, 1 - 4 * _SUZUKI, _SUZUKI, _SUZUKI),
-    6: (*_HALF, 1 - 2 * sum(_HALF), *_HALF[::-1]),
-}
 
 
 class _Here(NamedTuple):
@@ -81,7 +68,7 @@ class RATTLESteps(dfx.AbstractSolver):
     """
 
     system: MechanicalSystem
-    composition: int = eqx.field(static=True)
+    composition: Order = eqx.field(static=True)
 
     term_structure: ClassVar = dfx.AbstractTerm
 
@@ -119,14 +106,10 @@ class RATTLESteps(dfx.AbstractSolver):
         rests = Compensated(x, solver_state.x), Compensated(w, solver_state.w)
         start = _Point(t, *rests, here, here.usable)
 
-        def advance(point: _Point, fraction: Any) -> tuple[_Point, None]:
-            return self._step(point, fraction * length, unravel, args), None
+        def advance(point: _Point, fraction: Any) -> _Point:
+            return self._step(point, fraction * length, unravel, args)
 
-        fractions = jnp.asarray(COMPOSITIONS[self.composition], x.dtype)
-        if fractions.size == 1:
-            end, _ = advance(start, fractions[0])
-        else:
-            end, _ = lax.scan(advance, start, fractions)
+        end = composed(advance, start, self.composition, x.dtype)
         y1 = unravel(end.x.value), unravel(end.w.value)
         result = RESULTS.where(end.success, RESULTS.successful, nonlinear_failure())
         dense_info = dict(y0=y0, y1=y1, length=length)

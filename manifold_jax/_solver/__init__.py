@@ -3,3 +3,4 @@ from .local_coordinates import LocalCoordinates as LocalCoordinates
 from .projected import Projected as Projected
 from .stabilized import Stabilized as Stabilized
 from .step.frame import StepFrame as StepFrame
+from .symmetric import SymmetricProjection as SymmetricProjection
