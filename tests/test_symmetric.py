@@ -81,14 +81,15 @@ def test_order(order, times):
 
 
 def test_it_is_reversible():
-    """Ten thousand steps forth and back lead to the start."""
+    """Ten thousand steps forth and back lead to the start; without what is carried from step to step they miss
+    it by 7e-14."""
     solver = mj.SymmetricProjection(ON_SHELL)
     last = lambda sol: jax.tree.map(lambda leaf: leaf[-1], sol.ys)
     forth = orbit(solver, 100.0, 0.01)
     back = orbit(solver, 0.0, -0.01, last(forth), t0=100.0)
     assert forth.stats["num_steps"] == back.stats["num_steps"] == 10_000
     for ours, start in zip(last(back), ORBIT, strict=True):
-        np.testing.assert_allclose(ours, start, atol=1e-13)
+        np.testing.assert_allclose(ours, start, rtol=0, atol=1e-14)
 
 
 def test_what_is_not_constrained_has_no_trend():
@@ -143,12 +144,13 @@ def test_saved_values_are_on_the_manifold():
 
 
 def test_single_precision():
+    """Twenty thousand steps; without what is carried from step to step they end 2e-6 beside the solution."""
     with jax.enable_x64(False):
         args = jax.tree.map(lambda x: jnp.asarray(np.asarray(x, np.float32)), ARGS)
-        sol = breathe(2, 0.0, 10.0, 10_000, args, y0=jnp.array([1.0, 0.0]), max_steps=None)
+        sol = breathe(2, 0.0, 2.0, 20_000, args, y0=jnp.array([1.0, 0.0]), max_steps=None)
         assert sol.ys.dtype == jnp.float32
-        assert mj.constraint_violation(CIRCLE, 10.0, sol.ys[-1], args) < 5e-7
-        np.testing.assert_allclose(sol.ys[-1], exact(10.0, args), atol=1e-5)
+        assert mj.constraint_violation(CIRCLE, 2.0, sol.ys[-1], args) < 5e-7
+    np.testing.assert_allclose(sol.ys[-1], exact(2.0), rtol=0, atol=6e-7)
 
 
 def test_bad_input(as_a_user_meets_it):

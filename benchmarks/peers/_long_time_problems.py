@@ -1,8 +1,10 @@
-"""Two mechanisms of point masses on rods for long runs, and what is known of their solutions."""
+"""Problems for long runs, their methods at similar cost, and what is known of their solutions: two mechanisms of
+point masses on rods, and a planet."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import diffrax as dfx
 import jax.numpy as jnp
 import numpy as np
 
@@ -16,18 +18,31 @@ SPIN = 12.0
 
 
 class Task(NamedTuple):
-    """A mechanism with masses 1; states have leading axes of times. `step` is that of one evaluation of
-    forces, a power of two for single precision. `energy` is relative to that of the motion,
-    `momentum` is conserved, too, and `violation` is relative to lengths and speeds."""
+    """A problem; states have leading axes of times. `methods` are solvers, and how many times `step` their
+    steps are, a power of two for single precision. `energy` and `momentum` are relative, `violation`
+    is that of the constraint."""
 
     name: str
-    system: mj.MechanicalSystem
+    terms: Any
+    methods: dict[str, tuple[int, Any]]
     step: float
     y0: Any
     energy: Callable[[Any, Any], Any]
     momentum: Callable[[Any, Any], Any] | None
+    observed: str  # of these two, the one that no equation prescribes
     violation: Callable[[Any, Any], Any]
     field: Callable[[float, np.ndarray], np.ndarray]  # for SciPy, (q, v) as one vector
+
+
+def _methods(system: mj.MechanicalSystem) -> dict[str, tuple[int, Any]]:
+    """Steps in proportion to their evaluations of forces. RATTLE takes over one from the step before."""
+    return {
+        "RATTLE 2": (1, mj.rattle(system)),
+        "RATTLE 4": (5, mj.rattle(system, order=4)),
+        "RATTLE 6": (9, mj.rattle(system, order=6)),
+        "projected Dopri5": (6, mj.Projected(dfx.Dopri5(), system.constraint)),
+        "projected Dopri8": (12, mj.Projected(dfx.Dopri8(), system.constraint)),
+    }
 
 
 def pendulum() -> Task:
@@ -43,7 +58,10 @@ def pendulum() -> Task:
     energy = lambda q, v: ((v * v).sum(-1) / 2 + GRAVITY * q[..., 1]) / GRAVITY
     violation = lambda q, v: _of_rods(q[:, None], v[:, None], np.ones(1))
     y0 = jnp.array([1.0, 0.0]), jnp.zeros(2)
-    return Task("pendulum", system, 2**-7, y0, energy, None, violation, field)
+    methods = _methods(system)
+    return Task(
+        "pendulum", system.terms, methods, 2**-7, y0, energy, None, "energy", violation, field
+    )
 
 
 def _vectors(q: Any) -> Any:
@@ -94,7 +112,37 @@ def top() -> Task:
     momentum = lambda q, v: vertical(q, v) / np.abs(vertical(q0, v0))
     y0 = jnp.asarray(q0), jnp.asarray(v0)
     system = mj.MechanicalSystem(1.0, rods, weight)
-    return Task("top", system, 2**-9, y0, energy, momentum, of_points, field)
+    methods = _methods(system)
+    return Task(
+        "top", system.terms, methods, 2**-9, y0, energy, momentum, "energy", of_points, field
+    )
+
+
+def planet() -> Task:
+    """Kepler's ellipse of eccentricity 0.6 on the shell of its energy. The angular momentum is not constrained."""
+
+    def gravity(t: Any, y: Any, args: Any) -> Any:
+        q, v = y
+        return v, -q / jnp.sum(q * q) ** 1.5
+
+    def field(t: float, y: np.ndarray) -> np.ndarray:
+        cube = (y[0] * y[0] + y[1] * y[1]) ** 1.5
+        return np.array([y[2], y[3], -y[0] / cube, -y[1] / cube])
+
+    energy = lambda q, v: (v * v).sum(-1) - 2 / (q * q).sum(-1) ** 0.5
+    momentum = lambda q, v: (q[..., 0] * v[..., 1] - q[..., 1] * v[..., 0]) / 0.8
+    y0 = jnp.array([0.4, 0.0]), jnp.array([0.0, 2.0])
+    shell = mj.Invariants(lambda t, y, args: energy(*y), y0=y0)
+    methods = {
+        "symmetric 2": (2, mj.SymmetricProjection(shell)),
+        "symmetric 4": (8, mj.SymmetricProjection(shell, order=4)),
+        "symmetric 6": (16, mj.SymmetricProjection(shell, order=6)),
+        "projected Dopri5": (8, mj.Projected(dfx.Dopri5(), shell)),
+        "projected Dopri8": (16, mj.Projected(dfx.Dopri8(), shell)),
+    }
+    violation = lambda q, v: np.abs(energy(q, v) + 1)
+    terms = dfx.ODETerm(gravity)
+    return Task("planet", terms, methods, 2**-7, y0, energy, momentum, "momentum", violation, field)
 
 
 def _of_rods(d: Any, rate: Any, lengths: np.ndarray) -> np.ndarray:

@@ -1,10 +1,10 @@
-"""Energy and violation over a million steps: RATTLE, projected Runge-Kutta methods and SciPy at equal cost; and
-what is left of single precision.
+"""A million steps: RATTLE and symmetric projection, projected Runge-Kutta methods and SciPy; and what is left of
+single precision.
 
 `python -m benchmarks.peers.long_times --json benchmarks/results/long_times.json --plot benchmarks/results/long_times.png`
 
-Every method of constant steps evaluates forces a million times, over the same time; SciPy has a tolerance. The
-trend of the energy is the slope of the means of 20 parts of the run, with its standard error.
+RATTLE and the projected methods evaluate the forces of a mechanism a million times, over the same time; SciPy has a
+tolerance. The trend of a conserved quantity is the slope of the means of 20 parts of the run, with its standard error.
 """
 
 import time
@@ -30,38 +30,33 @@ from ..tools.measure import (
     use_one_core,
     write_json,
 )
-from ._long_time_problems import pendulum, Task, top
+from ._long_time_problems import pendulum, planet, Task, top
 
 
 SAMPLES = 1000
 PARTS = 20
 TOLERANCE = 1e-8  # of SciPy
-# The evaluations of forces in a step. RATTLE takes over one from the step before.
-METHODS: dict[str, tuple[int, Callable[[Any], Any]]] = {
-    "RATTLE 2": (1, lambda system: mj.rattle(system)),
-    "RATTLE 4": (5, lambda system: mj.rattle(system, order=4)),
-    "RATTLE 6": (9, lambda system: mj.rattle(system, order=6)),
-    "projected Dopri5": (6, lambda system: mj.Projected(dfx.Dopri5(), system.constraint)),
-    "projected Dopri8": (12, lambda system: mj.Projected(dfx.Dopri8(), system.constraint)),
-}
 
 
 def row(task: Task, method: str, times: Any, states: Any, seconds: float, **more: Any) -> dict:
     """Summarize states at `times`; the samples are for the picture."""
     q, v = states
     start = tuple(np.asarray(leaf) for leaf in task.y0)
-    errors = task.energy(q, v) - task.energy(*start)
-    means = [mean(part) for part in np.array_split(errors, PARTS)]
+    changes = {"energy": task.energy(q, v) - task.energy(*start)}
+    if task.momentum is not None:
+        changes["momentum"] = task.momentum(q, v) - task.momentum(*start)
+    observed = changes[task.observed]
+    means = [mean(part) for part in np.array_split(observed, PARTS)]
     middles = [mean(part) for part in np.array_split(times, PARTS)]
     (slope, _), covariance = np.polyfit(middles, means, 1, cov=True)
     out = dict(problem=task.name, method=method, **more, seconds=seconds)
-    out |= dict(energy=float(np.abs(errors).max()), trend=float(slope))
-    out |= dict(trend_noise=float(np.sqrt(covariance[0, 0])), momentum=None)
-    if task.momentum is not None:
-        change = task.momentum(q, v) - task.momentum(*start)
-        out["momentum"] = float(np.abs(change).max())
+    out |= {name: float(np.abs(change).max()) for name, change in changes.items()}
+    out.setdefault("momentum", None)
+    out |= dict(
+        observed=task.observed, trend=float(slope), trend_noise=float(np.sqrt(covariance[0, 0]))
+    )
     out["violation"] = float(task.violation(q, v).max())
-    largest = [float(np.abs(part).max()) for part in np.array_split(errors, 5 * PARTS)]
+    largest = [float(np.abs(part).max()) for part in np.array_split(observed, 5 * PARTS)]
     return out | dict(end=float(times[-1]), samples=largest)
 
 
@@ -71,15 +66,15 @@ def mean(part: np.ndarray) -> float:
 
 
 def constant_steps(task: Task, method: str, evaluations: int) -> dict[str, Any]:
-    each, build = METHODS[method]
+    each, solver = task.methods[method]
     steps = evaluations // each // SAMPLES * SAMPLES
-    h, solver, every = each * task.step, build(task.system), steps // SAMPLES
+    h, every = each * task.step, steps // SAMPLES
 
     @jax.jit
     def solve(y0):
         saveat = dfx.SaveAt(steps=every)
         options = dict(saveat=saveat, max_steps=steps + every)
-        return mj.diffeqsolve(task.system.terms, solver, 0.0, steps * h, h, y0, **options)
+        return mj.diffeqsolve(task.terms, solver, 0.0, steps * h, h, y0, **options)
 
     program = solve.lower(task.y0).compile()
     start = time.process_time()
@@ -88,7 +83,7 @@ def constant_steps(task: Task, method: str, evaluations: int) -> dict[str, Any]:
     assert sol.stats["num_steps"] == steps
     states = tuple(np.asarray(leaf)[:SAMPLES] for leaf in sol.ys)
     times = np.asarray(sol.ts)[:SAMPLES]
-    return row(task, method, times, states, seconds, step=h, evaluations=steps * each)
+    return row(task, method, times, states, seconds, step=h, steps=steps)
 
 
 def by_scipy(task: Task, evaluations: int) -> dict[str, Any]:
@@ -101,7 +96,7 @@ def by_scipy(task: Task, evaluations: int) -> dict[str, Any]:
     seconds = time.process_time() - start
     shape = (-1, *task.y0[0].shape)
     states = tuple(part.T.reshape(shape) for part in np.split(sol.y, 2))
-    more = dict(step=None, evaluations=sol.nfev)
+    more = dict(step=None, steps=None)  # they vary
     return row(task, "SciPy DOP853", times, states, seconds, **more)
 
 
@@ -110,9 +105,9 @@ def every_state(build: Callable[[], Task], steps: int, double: bool, carries: bo
     rounding has taken from the state."""
     with jax.enable_x64(double):
         task = build()
-        solver = mj.rattle(task.system)
+        _, solver = task.methods["RATTLE 2"]
         made = dict(
-            terms=task.system.terms, t0=0.0, t1=task.step, args=None
+            terms=task.terms, t0=0.0, t1=task.step, args=None
         )  # forces do not depend on time
 
         def advance(carry, _):
@@ -152,9 +147,13 @@ def table(rows: list[dict[str, Any]]) -> Table:
 
 
 def write_figure(path: Path, rows: list[dict[str, Any]], single: list[dict[str, Any]]) -> None:
-    figure, axes = plt.subplots(1, 3, figsize=(12, 4), layout="constrained")
+    figure, axes = plt.subplots(2, 2, figsize=(12, 8), layout="constrained")
+    axes = axes.ravel()
     names = list(dict.fromkeys(row["problem"] for row in rows))
-    colors = {name: f"C{i}" for i, name in enumerate([*METHODS, "SciPy DOP853"])}
+    colors = dict(zip("246", ("C0", "C1", "C2"), strict=True))
+    colors |= {"projected Dopri5": "C3", "projected Dopri8": "C4", "SciPy DOP853": "C5"}
+
+    color_of = lambda method: colors.get(method) or colors[method[-1]]
 
     def draw(axis: Any, row: dict[str, Any], label: str, **style: Any) -> None:
         times = row["end"] * np.arange(1, len(row["samples"]) + 1) / len(row["samples"])
@@ -163,16 +162,17 @@ def write_figure(path: Path, rows: list[dict[str, Any]], single: list[dict[str, 
     for axis, name in zip(axes, names, strict=False):
         for row in rows:
             if row["problem"] == name:
-                draw(axis, row, row["method"], color=colors[row["method"]])
-        axis.set(title=f"{name}: largest relative error of the energy", xlabel="time")
-    axes[0].legend(fontsize=8)
+                draw(axis, row, row["method"], color=color_of(row["method"]))
+        observed = next(row["observed"] for row in rows if row["problem"] == name)
+        axis.set(title=f"{name}: largest relative error of the {observed}", xlabel="time")
+        axis.legend(fontsize=8)
     for row in single:
         words = "compensated" if row["compensated"] else "not compensated"
         color = "C0" if row["problem"] == names[0] else "C3"
         style = dict(color=color, linestyle="-" if row["compensated"] else ":")
-        draw(axes[2], row, f"{row['problem']}, {words}", **style)
-    axes[2].set(title="RATTLE 2 in single precision: error of positions", xlabel="time")
-    axes[2].legend(fontsize=8)
+        draw(axes[3], row, f"{row['problem']}, {words}", **style)
+    axes[3].set(title="RATTLE 2 in single precision: error of positions", xlabel="time")
+    axes[3].legend(fontsize=8)
     for axis in axes:
         axis.title.set_fontsize(10)
         axis.grid(alpha=0.3)
@@ -182,19 +182,24 @@ def write_figure(path: Path, rows: list[dict[str, Any]], single: list[dict[str, 
 def main(
     json: Annotated[Path | None, typer.Option(metavar="FILE", help="Write results here.")] = None,
     plot: Annotated[Path | None, typer.Option(metavar="FILE", help="Draw a picture.")] = None,
-    evaluations: Annotated[int, typer.Option(min=12_000, help="Of forces.")] = 1_000_000,
-    quick: Annotated[bool, typer.Option(help="The pendulum alone.")] = False,
+    evaluations: Annotated[
+        int, typer.Option(min=12_000, help="Of forces, in a mechanism.")
+    ] = 1_000_000,
+    quick: Annotated[bool, typer.Option(help="Without the top, and two methods.")] = False,
 ) -> None:
     """Measure long runs of mechanisms."""
     use_one_core()
     use_double_precision()
-    problems = (pendulum,) if quick else (pendulum, top)
+    mechanisms = (pendulum,) if quick else (pendulum, top)
     rows = []
-    for build in problems:
+    for build in (*mechanisms, planet):
         task = build()
-        rows += [constant_steps(task, method, evaluations) for method in METHODS]
+        rows += [
+            constant_steps(task, method, evaluations)
+            for method in list(task.methods)[:: 4 if quick else 1]
+        ]
         rows.append(by_scipy(task, evaluations))
-    single = [row for build in problems for row in single_precision(build, evaluations)]
+    single = [row for build in mechanisms for row in single_precision(build, evaluations)]
     console = make_console()
     console.print(table(rows))
     console.print(table(single))
