@@ -108,6 +108,7 @@ def test_what_is_not_constrained_has_no_trend():
     assert drifts[1] > 0.3
 
 
+@pytest.mark.slow
 def test_gradients():
     """In both modes, and against differences, also of a parameter of the constraint."""
     end = lambda args: breathe(2, 0.0, 1.0, 10, args, max_steps=16).ys[-1] @ jnp.array([1.0, 2.0])
@@ -137,12 +138,14 @@ def test_a_batch_is_one_by_one():
         np.testing.assert_allclose(row, one(rate), atol=1e-14)
 
 
+@pytest.mark.slow
 def test_saved_values_are_on_the_manifold():
     ts = jnp.linspace(0.0, 1.5, 23)
     sol = breathe(2, 0.0, 1.5, 16, saveat=dfx.SaveAt(ts=ts))
     assert mj.constraint_violation(CIRCLE, ts, sol.ys, ARGS) < 1e-15
 
 
+@pytest.mark.slow
 def test_single_precision():
     """Twenty thousand steps; without what is carried from step to step they end 2e-6 beside the solution."""
     with jax.enable_x64(False):
