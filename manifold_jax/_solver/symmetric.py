@@ -30,7 +30,7 @@ from .terms import has_several
 _MOST = 30
 
 
-class _Point(NamedTuple):
+class _Place(NamedTuple):
     """Where a step begins or ends, in the time of Diffrax, and whether the steps so far succeeded."""
 
     t: FloatScalar
@@ -69,11 +69,11 @@ class SymmetricSteps(dfx.AbstractSolver):
     ) -> Any:
         x0, unravel = jfu.ravel_pytree(y0)
 
-        def advance(point: _Point, fraction: Any) -> _Point:
+        def advance(point: _Place, fraction: Any) -> _Place:
             after = point.t + fraction * (t1 - t0)
             return _Step(self.constraint, terms, point.t, after, unravel, args).made(point)
 
-        start = _Point(jnp.asarray(t0), Compensated(x0, solver_state), jnp.asarray(True))
+        start = _Place(jnp.asarray(t0), Compensated(x0, solver_state), jnp.asarray(True))
         end = composed(advance, start, self.composition, start.t.dtype)
         y1, control = unravel(end.y.value), terms.contr(t0, t1)
         slopes = [terms.vf_prod(t, y, args, control) for t, y in ((t0, y0), (t1, y1))]
@@ -92,7 +92,7 @@ class _Step(NamedTuple):
     unravel: Any
     args: Args
 
-    def made(self, start: _Point) -> _Point:
+    def made(self, start: _Place) -> _Place:
         """Solve the equations by simplified Newton iterations. The increment is computed once more from
         their solution: it is then as accurate as it is small."""
         y = start.y.value
@@ -121,7 +121,7 @@ class _Step(NamedTuple):
         success = root.scaled_residual <= NewtonProjection().tolerance_for(y.dtype)
         z = implicit_root(system, jnp.where(success, root.z, guess))
         end = start.y.plus(increment(z)[0])
-        return _Point(self.t1, end, start.success & success)
+        return _Place(self.t1, end, start.success & success)
 
     def _residual(self, t: FloatScalar, y: Array) -> Array:
         time = t * time_direction(self.terms)
