@@ -31,7 +31,7 @@ SMALLEST = {
     "benchmarks.dae_board.__main__": dict(problems="linear: generator", quick=True, repeats=1),
     "benchmarks.peers.approaches": dict(problems="pendulum", repeats=1, quick=True),
     "benchmarks.peers.impacts": dict(repeats=1, quick=True),
-    "benchmarks.peers.long_times": dict(evaluations=12_000, quick=True),
+    "benchmarks.peers.long_times": dict(evaluations=16_000, quick=True),
     "benchmarks.peers.mujoco_peers": dict(),
     "benchmarks.peers.pendulum_peers": dict(repeats=1),
     "benchmarks.peers.polymer": dict(bonds=6, long=1.0, repeats=1, quick=True),

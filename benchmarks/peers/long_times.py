@@ -183,7 +183,7 @@ def main(
     json: Annotated[Path | None, typer.Option(metavar="FILE", help="Write results here.")] = None,
     plot: Annotated[Path | None, typer.Option(metavar="FILE", help="Draw a picture.")] = None,
     evaluations: Annotated[
-        int, typer.Option(min=12_000, help="Of forces, in a mechanism.")
+        int, typer.Option(min=16_000, help="Of forces, in a mechanism.")
     ] = 1_000_000,
     quick: Annotated[bool, typer.Option(help="Without the top, and two methods.")] = False,
 ) -> None:
