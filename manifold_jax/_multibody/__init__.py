@@ -25,3 +25,4 @@ from .joints import (
 )
 from .mujoco import from_mujoco as from_mujoco, state_of_mujoco as state_of_mujoco
 from .rotations import quaternion as quaternion
+from .urdf import read_urdf as read_urdf, Robot as Robot

@@ -6,6 +6,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Float
 
@@ -13,10 +14,11 @@ from .._base.numbers import numbers_as_arrays
 from .._base.types import Args, RealScalarLike
 from .._mechanics import MechanicalSystem
 from .bodies import Bodies, Body, Pose
-from .checks import check_shape, floating
+from .checks import check_shape, floating, is_concrete
 from .equations import DRIVEN
 from .forces import AbstractForce
 from .frames import Frames, in_space, Placed, with_ground
+from .independent import find_independent, Independent
 from .joint_groups import group_restraints, JointGroup, reactions, residuals
 from .joints import AbstractRestraint, Revolute
 from .loads import AbstractLoads, group_forces
@@ -66,6 +68,7 @@ class Assembly(eqx.Module):
     loads: tuple[AbstractLoads, ...]
     gravity: Float[Array, "3"]
     redundant: bool = eqx.field(static=True)
+    independent: Independent | None
 
     def __init__(
         self,
@@ -83,6 +86,7 @@ class Assembly(eqx.Module):
         gravity = np.zeros(d) if gravity is None else gravity
         self.gravity = in_space(check_shape("`gravity`", gravity, (d,)))
         self.redundant = redundant
+        self.independent = None
         if self.bodies.planar and not self.joints:
             raise ValueError(
                 "Bodies in the plane without any joint have no constraints: without them use `diffrax.ODETerm` and the "
@@ -93,7 +97,27 @@ class Assembly(eqx.Module):
     def system(self) -> MechanicalSystem:
         """Masses, constraints and forces as a [`MechanicalSystem`][], which has the `terms`, the
         manifold `constraint` and the `multipliers`."""
-        return system_of(ConstantAssembly(self), self.redundant)
+        rows = None if self.independent is None else self.independent.rows
+        return system_of(ConstantAssembly(self), self.redundant, rows)
+
+    def without_dependent_equations(self) -> "Assembly":
+        """Return the assembly with as many equations of its joints as are independent, for closed loops whose
+        equations depend on each other in every pose. The rest follows from them, and is still part of `gaps`.
+
+        Faster than `redundant=True`, which decomposes a matrix at every stage, and exact whatever the ratio
+        of masses. The forces in the joints are then those of one of several possible sets, in which
+        equations that were left out carry none.
+
+        **Raises** `ValueError` if fewer equations are independent in the drawing than nearby (a singular
+        pose), and if numbers of the assembly are traced: call it outside of `jit`.
+        """
+        if not all(map(is_concrete, jtu.tree_leaves(self))):
+            raise ValueError(
+                "`without_dependent_equations` needs known numbers: call it outside of `jit`, `vmap` and derivatives, and replace "
+                "the numbers of its result inside, by `eqx.tree_at`."
+            )
+        found = find_independent(self)
+        return eqx.tree_at(lambda a: a.independent, self, found, is_leaf=lambda x: x is None)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -268,7 +292,7 @@ def _joint_forces(
     assembly: Assembly, t: RealScalarLike, y: tuple[Pose, Pose], args: Args
 ) -> dict[str, JointForce]:
     """Compiled also when called alone: operation by operation it takes many times as long."""
-    multipliers, frames = assembly.system.multipliers(t, y, args), Frames.of(*y)
+    multipliers, frames = _all_multipliers(assembly, t, y, args), Frames.of(*y)
     found, start = {}, 0
     for group in assembly.joints_at(t, args):
         k, r = group.residual(group.attachment.sides(frames)).shape
@@ -280,3 +304,14 @@ def _joint_forces(
         on_second = map(JointForce, forces, torques)
         found |= dict(zip(group.attachment.names, on_second, strict=True))
     return found
+
+
+def _all_multipliers(
+    assembly: Assembly, t: RealScalarLike, y: tuple[Pose, Pose], args: Args
+) -> Float[Array, " m"]:
+    """Return the multipliers of all joints; zero for equations that are not solved."""
+    multipliers = assembly.system.multipliers(t, y, args)
+    if assembly.independent is None:
+        return multipliers
+    size = sum(part.size for part in residuals(assembly.joints_at(t, args), y[0])) + len(assembly.names)
+    return jnp.zeros(size, multipliers.dtype).at[np.array(assembly.independent.rows)].set(multipliers)

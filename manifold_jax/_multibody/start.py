@@ -23,6 +23,7 @@ from .._linalg.dense import pseudo_invert
 from .bodies import check_orientation, Pose
 from .checks import check_shape, is_concrete, on_host, stack
 from .rotations import quaternion_rate
+from .system import ConstantAssembly, Equations
 
 
 # Joints count as closed below this gap (m, or the sine of an angle), or this many units of rounding.
@@ -99,7 +100,7 @@ class LoopClosure:
         self.assembly, self.at = assembly, (t, args)
         (self.x, self.unravel), (self.w, _) = map(jfu.ravel_pytree, y)
         self.free_x, self.free_w = (np.flatnonzero(~part) for part in kept)
-        joints = assembly.system.holonomic
+        joints = Equations(ConstantAssembly(assembly))
         phi = lambda t, x: jfu.ravel_pytree(joints(t, self.unravel(x), args))[0]
         self.phi = lambda x: phi(t, x)
         self.jacobian = lambda x: jax.jacfwd(phi, 1)(t, x)
@@ -112,7 +113,7 @@ class LoopClosure:
     def named_rows(self) -> list[tuple[str, np.ndarray]]:
         """The rows of every joint among the equations."""
         (t, args), bodies = self.at, self.assembly.bodies
-        of_joints = lambda: self.assembly.system.holonomic(t, bodies.drawing, args)
+        of_joints = lambda: Equations(ConstantAssembly(self.assembly))(t, bodies.drawing, args)
         named, start = [], 0
         for group, part in zip(self.assembly.joints, jax.eval_shape(of_joints), strict=False):
             rows = start + np.arange(part.size).reshape(part.shape)
@@ -125,18 +126,23 @@ class LoopClosure:
 
     def assembled(self) -> tuple[Pose, Pose]:
         """Close the joints by Gauss-Newton steps of least norm in free coordinates; velocities by one."""
-        x, w = np.array(self.x), np.array(self.w)
-        for _ in range(ITERATIONS):
-            phi, _, J = self.known(x)
-            if np.abs(phi).max(initial=0) < 10 * np.finfo(x.dtype).eps:
-                break
-            x[self.free_x] -= np.linalg.lstsq(J[:, self.free_x], phi, rcond=_dependent(J))[0]
+        x, w = self.closed(np.asarray(self.x)), np.array(self.w)
         advice = "Whatever the other bodies do, the joints cannot be closed: check lengths and points, or give less."
         self._check_positions(x, advice)
         _, driven, J = self.known(x)
         rate = driven + J @ w
         w[self.free_w] -= np.linalg.lstsq(J[:, self.free_w], rate, rcond=_dependent(J))[0]
         return self.unravel(jnp.asarray(x)), self.unravel(jnp.asarray(w))
+
+    def closed(self, x: np.ndarray) -> np.ndarray:
+        """Return coordinates near `x` for which the joints are closed, if there are."""
+        x = np.array(x)
+        for _ in range(ITERATIONS):
+            phi, _, J = self.known(x)
+            if np.abs(phi).max(initial=0) < 10 * np.finfo(x.dtype).eps:
+                break
+            x[self.free_x] -= np.linalg.lstsq(J[:, self.free_x], phi, rcond=_dependent(J))[0]
+        return x
 
     def check(self, y: tuple[Pose, Pose]) -> None:
         x, w = (np.array(jfu.ravel_pytree(part)[0]) for part in y)
@@ -169,17 +175,19 @@ class LoopClosure:
         raise ValueError(f"{what}: {worst}, {unit}. {advice}")
 
     def _check_rank(self, J: np.ndarray) -> None:
-        J = J / np.maximum(np.linalg.norm(J, axis=1, keepdims=True), np.finfo(J.dtype).tiny)
-        left, sizes, _ = np.linalg.svd(J, full_matrices=True)
-        rank = int(np.sum(sizes > _dependent(J) * sizes.max(initial=1)))
-        if rank == J.shape[0]:
+        solved = self.assembly.independent
+        rows = np.arange(J.shape[0]) if solved is None else np.array(solved.rows)
+        number, dependent = dependent_equations(J[rows])
+        if number == 0:
             return
-        among = np.abs(left[:, rank:]).max(axis=1)
-        names = [name for name, rows in self.named_rows if among[rows].max() > 1e-6]
+        among = np.zeros(J.shape[0], bool)
+        among[rows[dependent]] = True
+        names = [name for name, rows in self.named_rows if among[rows].any()]
         raise ValueError(
-            f"{J.shape[0] - rank} of the {J.shape[0]} equations of the joints depend on others in this pose, among those of "
+            f"{number} of the {J.shape[0]} equations of the joints depend on others in this pose, among those of "
             f"{', '.join(names[:10])}{', ...' if len(names) > 10 else ''}. If they do so in every pose (closed loops), "
-            "write `Assembly(..., redundant=True)`; if in this one alone, start beside it."
+            "write `Assembly(..., redundant=True)`, or take `assembly.without_dependent_equations()`; if in this one alone, "
+            "start beside it."
         )
 
     def assembled_when_run(self) -> tuple[Pose, Pose]:
@@ -217,6 +225,14 @@ class LoopClosure:
         failed = ~(jnp.max(gaps) <= _closed(np.zeros(1, x.dtype)))
         worst = jnp.argmax(jnp.where(jnp.isnan(gaps), jnp.inf, gaps))
         return eqx.branched_error_if(x, failed, worst, messages)
+
+
+def dependent_equations(J: np.ndarray) -> tuple[int, np.ndarray]:
+    """Return how many of the rows depend on others, and which rows take part."""
+    J = J / np.maximum(np.linalg.norm(J, axis=1, keepdims=True), np.finfo(J.dtype).tiny)
+    left, sizes, _ = np.linalg.svd(J, full_matrices=True)
+    rank = int(np.sum(sizes > _dependent(J) * sizes.max(initial=1)))
+    return J.shape[0] - rank, np.abs(left[:, rank:]).max(axis=1, initial=0) > 1e-6
 
 
 def _least_norm(J: Float[Array, "m n"], b: Float[Array, " m"]) -> Float[Array, " n"]:

@@ -5,6 +5,7 @@ from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from .._base.types import Args, RealScalarLike
@@ -30,16 +31,21 @@ class _Mass(eqx.Module):
         return self.source(args).bodies.mass_matrix(q)
 
 
-class _Joints(AbstractPositions):
-    """The equations of joints, and the norms of quaternions."""
+class Equations(AbstractPositions):
+    """The equations of joints, and the norms of quaternions: all, or those of the given numbers."""
 
     source: Callable
+    rows: tuple[int, ...] | None = eqx.field(static=True, default=None)
 
-    def __call__(self, t: RealScalarLike, q: Pose, args: Args) -> tuple[Array, ...]:
+    def __call__(
+        self, t: RealScalarLike, q: Pose, args: Args
+    ) -> tuple[Array, ...] | Float[Array, " m"]:
         equations = residuals(self.source(args).joints_at(t, args), q)
-        if q.planar:
+        if not q.planar:
+            equations = (*equations, (jnp.sum(q.orientation**2, axis=1) - 1) / 2)
+        if self.rows is None:
             return equations
-        return (*equations, (jnp.sum(q.orientation**2, axis=1) - 1) / 2)
+        return jnp.concatenate([part.reshape(-1) for part in equations])[np.array(self.rows)]
 
     def jacobian(self, t: RealScalarLike, q: Pose, args: Args) -> Float[Array, "m n"]:
         rows = jacobian(self.source(args).joints_at(t, args), q)
@@ -47,7 +53,8 @@ class _Joints(AbstractPositions):
             p, own = q.orientation, jnp.eye(q.position.shape[0], dtype=rows.dtype)
             norms = own[:, :, None] * jnp.pad(p, ((0, 0), (3, 0)))[:, None, :]
             rows = jnp.concatenate([rows, norms])
-        return rows.reshape(rows.shape[0], -1)
+        rows = rows.reshape(rows.shape[0], -1)
+        return rows if self.rows is None else rows[np.array(self.rows)]
 
 
 class _Forces(eqx.Module):
@@ -69,5 +76,8 @@ class _Forces(eqx.Module):
         return Pose(force, turning + assembly.bodies.gyroscopic(q, v))
 
 
-def system_of(source: Callable, redundant: bool) -> MechanicalSystem:
-    return MechanicalSystem(_Mass(source), _Joints(source), _Forces(source), redundant=redundant)
+def system_of(
+    source: Callable, redundant: bool, rows: tuple[int, ...] | None = None
+) -> MechanicalSystem:
+    equations = Equations(source, rows)
+    return MechanicalSystem(_Mass(source), equations, _Forces(source), redundant=redundant)

@@ -1,0 +1,110 @@
+"""Closed loops of a tree of links: the joint coordinates for which they are closed.
+
+Source: Levenberg-Marquardt steps, Nocedal & Wright, Numerical Optimization (2006), sec. 10.3, for the
+assembly analysis of Haug, Computer Aided Kinematics and Dynamics of Mechanical Systems (1989), ch. 4.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from .kinematic_tree import KinematicTree
+from .urdf_elements import Placement
+
+
+_STARTS, _SPREAD = 20, 0.3
+_STEPS = 200
+_CLOSED = 1e-10  # largest gap of a closed loop: in m, or the difference of axes
+_ROUNDING = 1e-15
+_LEAST_DAMPING, _MOST_DAMPING = 1e-12, 1e6
+
+
+class Closure(NamedTuple):
+    """Two links whose frames coincide, or only their origins."""
+
+    name: str
+    first: str
+    second: str
+    is_rigid: bool
+
+
+def close_loops(
+    tree: KinematicTree, closures: Sequence[Closure], x: np.ndarray, held: Sequence[int]
+) -> np.ndarray:
+    """Return coordinates for which all loops are closed, found from `x` or, where that fails, from starts
+    beside it; those `held` stay."""
+    free = np.setdiff1d(np.arange(tree.size), held)
+    random, given, rest, best = np.random.default_rng(0), x, dict(tree.rest), None
+    for _ in range(_STARTS):
+        x, gap = _descend(tree, closures, x.copy(), free)
+        size = np.abs(gap).max(initial=0)
+        if best is None or size < best[0]:
+            best = size, x, tree.rest
+        if size <= _CLOSED:
+            break
+        tree.rest, x = dict(rest), given.copy()
+        x[free] += random.normal(scale=_SPREAD, size=free.size)
+    _, x, tree.rest = best
+    _check_closed(tree, closures, x)
+    return x
+
+
+def _descend(
+    tree: KinematicTree, closures: Sequence[Closure], x: np.ndarray, free: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return coordinates where the gaps are least, and the gaps."""
+    damping, (gap, J) = 1e-2, _gaps(tree, closures, x)
+    for _ in range(_STEPS):
+        if np.abs(gap).max(initial=0) < _ROUNDING or damping > _MOST_DAMPING:
+            break
+        trial, own = x.copy(), J[:, free]
+        trial[free] -= np.linalg.solve(own.T @ own + damping * np.eye(free.size), own.T @ gap)
+        new_gap, _ = _gaps(tree, closures, trial)
+        if new_gap @ new_gap < gap @ gap:
+            x, damping = trial, max(damping / 5, _LEAST_DAMPING)
+            tree.turn_ball_joints(x)
+            gap, J = _gaps(tree, closures, x)
+        else:
+            damping *= 4
+    return x, gap
+
+
+def _gaps(
+    tree: KinematicTree, closures: Sequence[Closure], x: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return all gaps and their derivatives by the coordinates."""
+    placed, axes = tree.place(x)
+    gaps, rows = [np.zeros(0)], [np.zeros((0, tree.size))]
+    for closure in closures:
+        gap = closure_gap(placed, closure)
+        J = np.zeros((12, tree.size))
+        for link, sign in ((closure.first, -1), (closure.second, 1)):
+            rotation, origin = placed[link]
+            for i in tree.ancestors(link):
+                turns, axis, at = axes[i]
+                J[:3, i] += sign * (np.cross(axis, origin - at) if turns else axis)
+                J[3:, i] += sign * turns * np.cross(axis, rotation.T).reshape(-1)
+        gaps.append(gap)
+        rows.append(J[: gap.size])
+    return np.concatenate(gaps), np.concatenate(rows)
+
+
+def closure_gap(placed: Mapping[str, Placement], closure: Closure) -> np.ndarray:
+    """Return the differences of the origins, and for a rigid closure those of the three axes."""
+    first, second = placed[closure.first], placed[closure.second]
+    gap = second.origin - first.origin
+    if not closure.is_rigid:
+        return gap
+    return np.concatenate([gap, (second.rotation - first.rotation).T.reshape(-1)])
+
+
+def _check_closed(tree: KinematicTree, closures: Sequence[Closure], x: np.ndarray) -> None:
+    placed, _ = tree.place(x)
+    sizes = [(np.abs(closure_gap(placed, closure)).max(), closure.name) for closure in closures]
+    if open_ := sorted((pair for pair in sizes if not pair[0] <= _CLOSED), reverse=True):
+        worst = ", ".join(f"{name} (gap {size:.3g})" for size, name in open_[:5])
+        raise ValueError(
+            f"The loops cannot be closed: {worst}, in m or rad. Check `closures`, lengths, and the joint coordinates in "
+            "`configuration`, from which they are closed."
+        )

@@ -1,0 +1,256 @@
+"""Robots from URDF files, with closed loops."""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from .._base.types import Args, RealScalarLike
+from .._base.user_functions import check_function
+from .assembly import Assembly
+from .ball_joints import merge_hinges
+from .bodies import GROUND, Pose
+from .checks import check_shape, floating
+from .closures import motions_of, read_additions
+from .forces import AbstractForce, JointSpring, Motor
+from .joints import AbstractJoint, AbstractRestraint, Prismatic, Revolute, Spherical
+from .kinematic_tree import KinematicTree
+from .loops import close_loops, Closure
+from .rigid_groups import body_names, connections, Groups, joint_between
+from .rotations import rotation_matrix
+from .urdf_elements import Joint, Placement, read_elements
+
+
+class LinkFrame(NamedTuple):
+    """The frame of a link: the body that the link is part of, and where the frame is in the drawing."""
+
+    body: str
+    at: tuple[float, ...]
+    rotation: tuple[tuple[float, ...], ...]
+
+
+class Robot(eqx.Module):
+    """What [`read_urdf`][manifold_jax.multibody.read_urdf] returns.
+
+    **Attributes:**
+
+    - `assembly`: the [`Assembly`][manifold_jax.multibody.Assembly], drawn with all loops closed.
+    - `configuration`: the coordinates (rad or m) of hinges and sliders in the drawing, by the names
+        of the file. `assembly.joint_coordinates` counts from there.
+    - `limits`: lower and upper limits of these in the file. They are not enforced: a stop is an
+        [`impact`][manifold_jax.impact].
+    - `motors`: the names of joints with motors, in the order of the values of `control`.
+    - `frames`: for every link of the file its body, and origin `at` and rotation of its frame in the
+        drawing. `markers={"foot": robot.frames["foot"][:2]}` draws the path of its origin.
+    """
+
+    assembly: Assembly
+    configuration: dict[str, float] = eqx.field(static=True)
+    limits: dict[str, tuple[float, float]] = eqx.field(static=True)
+    motors: tuple[str, ...] = eqx.field(static=True)
+    frames: dict[str, LinkFrame] = eqx.field(static=True)
+
+    def frame(self, y: tuple[Pose, Pose], link: str) -> tuple[Array, Array]:
+        """Return origin `(3,)` and rotation matrix `(3, 3)` of the frame of a link, for a state or for
+        states with leading axes."""
+        if link not in self.frames:
+            raise ValueError(f"`link` is {link!r}; links are {list(self.frames)[:12]}.")
+        body, at, rotation = self.frames[link]
+        origin, _ = self.assembly.point(y, body, at, drawn=True)
+        if body == GROUND:
+            turned = jnp.broadcast_to(jnp.eye(3, dtype=origin.dtype), (*origin.shape, 3))
+        else:
+            turned = rotation_matrix(self.assembly.motion(y, body).orientation)
+        return origin, turned @ jnp.asarray(rotation, origin.dtype)
+
+
+def read_urdf(
+    file: Any,
+    *,
+    closures: Any = None,
+    floating_base: bool = False,
+    configuration: Mapping[str, float] | None = None,
+    control: Callable | None = None,
+    joints: Sequence[AbstractRestraint] = (),
+    forces: Sequence[AbstractForce] = (),
+    gravity: Any = (0.0, 0.0, -9.81),
+    ignore: Sequence[str] = (),
+) -> Robot:
+    """Read a robot from a URDF file, with closed loops.
+
+    URDF describes trees. Loops are closed by `closures`, in the form of the collection
+    [example-parallel-robots](https://github.com/Gepetto/example-parallel-robots):
+
+    ```yaml
+    closed_loop: [['elbow_left', 'elbow_right']]  # links whose frames coincide
+    type: ['6d']                                  # '6d': a weld, '3d': only their origins, a ball joint
+    name_mot: ['shoulder_left', 'shoulder_right'] # joints with motors
+    joint_name: ['ankle', 'knee']                 # joints of another type than in the URDF:
+    joint_type: ['SPHERICAL', 'UJOINT_XY']        # or 'FIXED'; axes are those of the joint's frame
+    ```
+
+    Links that are welded together are one body, with the name of the heaviest one; links without mass
+    between hinges become universal or ball joints. Of the equations of its joints as many are solved as are
+    independent, see [`Assembly`][].without_dependent_equations.
+
+    **Arguments:**
+
+    - `file`: the path of the URDF, or a string of XML. Meshes are not read.
+    - `closures`: the path of a YAML file as above (extra `robots`), or a mapping.
+    - `floating_base`: whether the root link moves freely; otherwise it is the ground.
+    - `configuration`: joint coordinates (rad or m) of the drawing, by name. The other ones are those for
+        which all loops are closed and that are nearest to zero.
+    - `control`: `f(t, args)` returns the torques or forces `(number of motors,)` of the motors; `None`
+        for none.
+    - `joints`, `forces`: further ones for the [`Assembly`][], such as [`Drive`][] and [`Motor`][].
+    - `gravity` (m/s^2).
+    - `ignore`: what is not supported, to leave it out: some of `("friction", "mimic")`.
+
+    **Returns:** a [`Robot`][].
+
+    **Raises** `ValueError` with the names in the file: for loops that cannot be closed and their gaps (m or
+    rad), links without mass where it is needed, inertias that no body has, Coulomb friction and joints
+    that mimic others unless ignored. `from_mujoco` reads URDF, too, without loops.
+    """
+    links, elements = read_elements(file)
+    _refuse_unsupported(elements, ignore)
+    additions = read_additions(closures, links, elements)
+    links, elements = merge_hinges(links, elements, additions.used)
+    motions = {joint.name: motions_of(joint, additions.joint_types) for joint in elements}
+    tree = KinematicTree(links, elements, motions)
+    x = _closed(tree, additions.closures, configuration or {})
+    placed, axes = tree.place(x)
+    groups = Groups(tree, additions.closures, placed)
+    names = body_names(groups, tree.root, floating_base)
+    own = [joint_between(c, names) for c in connections(tree, groups, axes)]
+    own += _ball_joints(additions.closures, groups, names, placed)
+    acting = _dampers(elements, own) + _motors(additions.motors, own, control)
+    bodies = [groups.body(group) for group in names if names[group] != GROUND]
+    if not bodies:
+        raise ValueError("`file` has no link with mass that moves.")
+    assembly = Assembly(bodies, [*own, *joints], [*acting, *forces], gravity=gravity)
+    return Robot(
+        assembly.without_dependent_equations(),
+        _coordinates(tree, x),
+        {joint.name: joint.limits for joint in elements if joint.limits is not None},
+        additions.motors,
+        _frames(groups, names, placed),
+    )
+
+
+def _frames(
+    groups: Groups, names: Mapping[str, str], placed: Mapping[str, Placement]
+) -> dict[str, LinkFrame]:
+    as_tuple = lambda matrix: tuple(map(tuple, matrix.tolist()))
+    return {
+        link: LinkFrame(names[group], tuple(at.origin.tolist()), as_tuple(at.rotation))
+        for link, at in placed.items()
+        if (group := groups.of(link)) in names
+    }
+
+
+def _refuse_unsupported(joints: Sequence[Joint], ignore: Sequence[str]) -> None:
+    if unknown := sorted(set(ignore) - {"friction", "mimic"}):
+        raise ValueError(f"`ignore` has {unknown}; known are 'friction' and 'mimic'.")
+    faults = {
+        "friction": [joint.name for joint in joints if joint.friction != 0],
+        "mimic": [joint.name for joint in joints if joint.mimics],
+    }
+    for word, names in faults.items():
+        if names and word not in ignore:
+            raise ValueError(
+                f"`file` has joints with <{word}>, which is not supported: {', '.join(names[:10])}. Leave it out by "
+                f"`ignore=({word!r},)`, or change the file."
+            )
+
+
+def _closed(
+    tree: KinematicTree, closures: Sequence[Closure], configuration: Mapping[str, float]
+) -> np.ndarray:
+    """Return the coordinates of the drawing."""
+    x, held = np.zeros(tree.size), []
+    for name, value in configuration.items():
+        own = tree.columns.get(name, ())
+        if len(own) != 1:
+            known = [name for name, own in tree.columns.items() if len(own) == 1]
+            raise ValueError(
+                f"`configuration` has {name!r}, which is no hinge or slider of `file`; these are {known[:12]}."
+            )
+        x[own[0]] = check_shape(f"`configuration` of {name!r}", value, ())
+        held += own
+    return close_loops(tree, closures, x, held)
+
+
+def _coordinates(tree: KinematicTree, x: np.ndarray) -> dict[str, float]:
+    return {name: float(x[own[0]]) for name, own in tree.columns.items() if len(own) == 1}
+
+
+def _ball_joints(
+    closures: Sequence[Closure],
+    groups: Groups,
+    names: Mapping[str, str],
+    placed: Mapping[str, Placement],
+) -> list[AbstractJoint]:
+    """Return the joints of loops that are closed at a point."""
+    found = []
+    for closure in closures:
+        if closure.is_rigid:
+            continue
+        ends = [groups.of(link) for link in (closure.first, closure.second)]
+        if missing := [groups.body_name(end) for end in ends if end not in names]:
+            raise ValueError(
+                f"The loop {closure.name} ends at the link {missing[0]!r}, which has no mass. Give it mass and inertia in "
+                "`file`, or close the loop by type '6d'."
+            )
+        bodies = [names[end] for end in ends]
+        if bodies[0] == bodies[1]:
+            raise ValueError(f"The loop {closure.name} connects {bodies[0]!r} with itself.")
+        found.append(Spherical(*bodies, at=placed[closure.first].origin, name=closure.name))
+    return found
+
+
+def _dampers(elements: Sequence[Joint], joints: Sequence[AbstractJoint]) -> list[AbstractForce]:
+    single = {joint.name for joint in joints if isinstance(joint, Revolute | Prismatic)}
+    damped = [joint for joint in elements if joint.damping != 0]
+    if lost := [joint.name for joint in damped if joint.name not in single]:
+        raise ValueError(
+            f"`file` gives damping to {', '.join(lost)}, which is part of a joint with several coordinates or does not "
+            "move. Remove it, and add a `Damper` or `Torque` by `forces`."
+        )
+    return [JointSpring(j.name, damping=j.damping, name=f"damping of {j.name}") for j in damped]
+
+
+def _motors(
+    motors: tuple[str, ...], joints: Sequence[AbstractJoint], control: Callable | None
+) -> list[AbstractForce]:
+    if control is None:
+        return []
+    check_function("control", control, "f(t, args)")
+    if not motors:
+        raise ValueError("`control` needs motors: name their joints in `closures`, {'name_mot': [...]}.")
+    single = {joint.name for joint in joints if isinstance(joint, Revolute | Prismatic)}
+    if passive := [name for name in motors if name not in single]:
+        raise ValueError(
+            f"`closures`: 'name_mot' has {passive}, which have no single coordinate for a torque or force: motors belong to "
+            "hinges and sliders between links with mass."
+        )
+    return [Motor(name, _Control(control, i, len(motors))) for i, name in enumerate(motors)]
+
+
+class _Control(eqx.Module):
+    """One of the values of `control`."""
+
+    control: Callable
+    index: int = eqx.field(static=True)
+    number: int = eqx.field(static=True)
+
+    def __call__(self, t: RealScalarLike, args: Args) -> Float[Array, ""]:
+        values = floating(self.control(t, args))
+        if values.shape != (self.number,):
+            raise ValueError(
+                f"`control` must return the values of all motors, shape ({self.number},), got {values.shape}."
+            )
+        return values[self.index]

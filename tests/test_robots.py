@@ -1,0 +1,118 @@
+"""Robots from URDF files with closed loops, against textbook equations of a five-bar in the plane."""
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import robot_cases as cases
+
+import manifold_jax as mj
+
+
+mb = mj.multibody
+TORQUES = np.array([0.7, -0.4])
+
+
+def read(**options):
+    given = dict(closures=cases.CLOSURES, configuration=cases.START, control=lambda t, args: args)
+    return mb.read_urdf(cases.five_bar(), **(given | options))
+
+
+@pytest.fixture(scope="module")
+def robot():
+    return read()
+
+
+def angles_of(robot, y):
+    """Of upper and lower links from the vertical, in the frames of the file."""
+    rotations = (robot.frame(y, f"{side} {part}")[1] for side in ("left", "right") for part in ("upper", "lower"))
+    return np.array([np.arctan2(R[0, 2], R[2, 2]) for R in map(np.asarray, rotations)])
+
+
+def textbook(angles, rates, torques):
+    """Accelerations of the four angles."""
+    arms = [cases.arm(side, angles[i : i + 2], rates[i : i + 2]) for i, side in ((0, "left"), (2, "right"))]
+    M, J = np.zeros((4, 4)), np.hstack([arms[0][2], -arms[1][2]])
+    M[:2, :2], M[2:, 2:] = arms[0][0], arms[1][0]
+    braking = cases.DAMPING * (rates[3] - rates[2])
+    force = np.array([torques[0], 0, torques[1] + braking, -braking]) - np.concatenate([arms[0][1], arms[1][1]])
+    system = np.block([[M, J.T], [J, np.zeros((2, 2))]])
+    return np.linalg.solve(system, np.concatenate([force, arms[1][3] - arms[0][3]]))[:4]
+
+
+def test_accelerations_are_those_of_the_textbook(robot):
+    y = robot.assembly.state(
+        angular_velocities={"left upper": (0, 1.3, 0), "right upper": (0, -0.8, 0)}, assemble=True
+    )
+    angles = angles_of(robot, y)
+    assert np.allclose(cases.tip("left", angles[:2]), cases.tip("right", angles[2:]), atol=1e-14)
+    assert angles[0] == pytest.approx(-0.6, abs=1e-14) and angles[2] == pytest.approx(0.5, abs=1e-14)
+    names = ("left upper", "left lower", "right upper", "right lower")
+    spins = lambda y: jnp.stack([robot.assembly.motion(y, name).angular_velocity for name in names])
+    a = robot.assembly.system.accelerations(0.0, y, TORQUES)
+    rates, change = eqx.filter_jvp(spins, (y,), ((y[1], a),))
+    expected = textbook(angles, np.asarray(rates[:, 1]), TORQUES)
+    np.testing.assert_allclose(change[:, 1], expected, rtol=1e-11, atol=1e-11)
+    np.testing.assert_allclose(change[:, ::2], 0, atol=1e-11)
+
+
+def test_bodies_joints_and_frames_have_the_names_of_the_file(robot):
+    assert set(robot.assembly.names) == {"left upper", "left lower", "right upper", "right lower"}
+    assert "about x about y about z" in robot.assembly.joint_names
+    assert robot.motors == ("left shoulder", "right shoulder")
+    assert robot.limits["left shoulder"] == (-2.0, 1.5)
+    assert set(robot.configuration) == {"left shoulder", "right shoulder", "right elbow", "tip"}
+    # What is welded to the left lower link is part of it.
+    tip = robot.frames["right tip"]
+    assert tip.body == "left lower"
+    np.testing.assert_allclose(tip.at, robot.frames["left tip"].at, atol=1e-14)
+    assert robot.frames["base"].body == mb.GROUND
+    # Of 4 bodies with 7 coordinates, two motions are left; all equations are still reported.
+    assert len(robot.assembly.independent.rows) == 4 * 7 - 2
+    assert sum(gap.size for gap in robot.assembly.gaps(robot.assembly.state()[0]).values()) == 23
+
+
+@eqx.filter_jit
+def end_of_swing(assembly, torques):
+    """The tip after 0.2 s; all numbers of the file are leaves of the assembly."""
+    system, start = assembly.system, assembly.state(assemble=True)
+    hook = mj.Projected(dfx.Tsit5(), system.constraint)
+    sol = mj.diffeqsolve(system.terms, hook, 0.0, 0.2, 0.02, start, torques, adjoint=dfx.DirectAdjoint())
+    at, _ = assembly.point(jax.tree.map(lambda y: y[-1], sol.ys), "left lower", (0.0, 0.0, 0.22))
+    return at @ jnp.array([1.0, 0.0, 0.3])
+
+
+def mass(assembly):
+    return assembly.bodies.mass
+
+
+def hinge_point(assembly):
+    return assembly.joints[0].attachment.points
+
+
+def damping(assembly):
+    return next(load.laws.damping for load in assembly.loads if "right elbow" in load.attachment.names)
+
+
+@pytest.mark.slow
+def test_gradients_by_numbers_of_the_file(robot):
+    """By a mass, a damping, a length and a torque: reverse mode, forward mode and differences."""
+    torques = jnp.asarray(TORQUES)
+    by_file = eqx.filter_jit(eqx.filter_grad(end_of_swing))(robot.assembly, torques)
+    places = ((mass, (1,)), (damping, (0,)), (hinge_point, (1, 1, 2)))
+    for leaf, place in places:
+        shifted = lambda h, leaf=leaf, place=place: eqx.tree_at(
+            leaf, robot.assembly, leaf(robot.assembly).at[place].add(h)
+        )
+        f = lambda h, shifted=shifted: float(end_of_swing(shifted(h), torques))
+        h = 1e-4
+        difference = (8 * (f(h) - f(-h)) - f(2 * h) + f(-2 * h)) / (12 * h)
+        gradient = float(leaf(by_file)[place])
+        assert abs(gradient) > 1e-5
+        assert gradient == pytest.approx(difference, rel=1e-7)
+    tangent = jax.tree.map(jnp.ones_like, eqx.filter(robot.assembly, eqx.is_inexact_array))
+    _, forward = eqx.filter_jvp(end_of_swing, (robot.assembly, torques), (tangent, None))
+    along = sum(jnp.sum(leaf) for leaf in jax.tree.leaves(by_file))
+    assert float(forward) == pytest.approx(float(along), rel=1e-10)
