@@ -38,8 +38,8 @@ def four_bar_state(robot, y):
     return robot.state(*(by_name(rows) for rows in (q[:, :2], q[:, 2], v[:, :2], v[:, 2])))
 
 
-def four_bar_in_space(args, y, **options):
-    """The same in the x-z plane of space, with the pose of `y` as the drawing."""
+def four_bar_in_space(args, y, more=(), **options):
+    """The same in the x-z plane of space, with the pose of `y` as the drawing, and `more` joints."""
     q = np.asarray(y[0]).reshape(3, 3)
     lengths, masses = np.asarray(args.lengths), np.asarray(args.masses)
     halves = np.stack([np.cos(q[:, 2]), np.sin(q[:, 2])], axis=1) * lengths[:3, None] / 2
@@ -60,7 +60,7 @@ def four_bar_in_space(args, y, **options):
     pairs, points = (*pairs, ("rocker", mb.GROUND)), [*points, q[2, :2] - halves[2]]
     joints = [mb.Revolute(*pair, at=in_space(p), axis=axis) for pair, p in zip(pairs, points)]
     gravity = (0.0, 0.0, -float(args.gravity))
-    return mb.Assembly(bodies, joints, gravity=gravity, **options)
+    return mb.Assembly(bodies, [*joints, *more], gravity=gravity, **options)
 
 
 def slider_crank(args):

@@ -79,7 +79,7 @@ def end_of_swing(assembly, torques):
     """The tip after 0.2 s; all numbers of the file are leaves of the assembly."""
     system, start = assembly.system, assembly.state(assemble=True)
     hook = mj.Projected(dfx.Tsit5(), system.constraint)
-    sol = mj.diffeqsolve(system.terms, hook, 0.0, 0.2, 0.02, start, torques, adjoint=dfx.DirectAdjoint())
+    sol = mj.diffeqsolve(system.terms, hook, 0.0, 0.2, 0.02, start, torques)
     at, _ = assembly.point(jax.tree.map(lambda y: y[-1], sol.ys), "left lower", (0.0, 0.0, 0.22))
     return at @ jnp.array([1.0, 0.0, 0.3])
 
@@ -93,12 +93,13 @@ def hinge_point(assembly):
 
 
 def damping(assembly):
-    return next(load.laws.damping for load in assembly.loads if "right elbow" in load.attachment.names)
+    loads = (load for load in assembly.loads if "damping of right elbow" in load.attachment.names)
+    return next(loads).laws.damping
 
 
 @pytest.mark.slow
 def test_gradients_by_numbers_of_the_file(robot):
-    """By a mass, a damping, a length and a torque: reverse mode, forward mode and differences."""
+    """By a mass, a damping and a length: reverse mode and differences."""
     torques = jnp.asarray(TORQUES)
     by_file = eqx.filter_jit(eqx.filter_grad(end_of_swing))(robot.assembly, torques)
     places = ((mass, (1,)), (damping, (0,)), (hinge_point, (1, 1, 2)))
@@ -112,7 +113,62 @@ def test_gradients_by_numbers_of_the_file(robot):
         gradient = float(leaf(by_file)[place])
         assert abs(gradient) > 1e-5
         assert gradient == pytest.approx(difference, rel=1e-7)
-    tangent = jax.tree.map(jnp.ones_like, eqx.filter(robot.assembly, eqx.is_inexact_array))
-    _, forward = eqx.filter_jvp(end_of_swing, (robot.assembly, torques), (tangent, None))
-    along = sum(jnp.sum(leaf) for leaf in jax.tree.leaves(by_file))
-    assert float(forward) == pytest.approx(float(along), rel=1e-10)
+
+
+def test_a_free_base_falls():
+    """Without a support all links fall, and a torque of a motor turns nothing as a whole."""
+    robot = read(floating_base=True, gravity=(0.0, 0.0, -9.81))
+    y = robot.assembly.state()
+    a = robot.assembly.system.accelerations(0.0, y, TORQUES)
+    mass = robot.assembly.bodies.mass[:, None]
+    assert len(robot.assembly.names) == 5
+    falling = np.sum(mass * a.position, axis=0) / np.sum(mass)
+    np.testing.assert_allclose(falling, [0, 0, -9.81], atol=1e-10)
+
+
+CHANGES = {  # of the file and the arguments, and what is said
+    "gap": (("0 0 0.4", "0 0 1.4"), {}, r"loops cannot be closed: left tip-right tip \(gap 0\.\d+\)"),
+    "pose": ((), {"configuration": {"left shoulder": -1.5, "right shoulder": 1.5}}, "cannot be closed"),
+    "three joints": (
+        (
+            '<link name="first"/>',
+            '<link name="first"/>' + cases.link("flap", 0.1, 0.1) + cases.joint("j", "revolute", "first", "flap"),
+        ),
+        {},
+        "'first' has no mass, but joins 'about x', 'j', 'about y'",
+    ),
+    "friction": (("damping=", "friction='1' damping="), {}, "<friction>.*right elbow.*ignore="),
+    "mimic": (("<axis", "<mimic joint='tip'/><axis"), {}, "<mimic>"),
+    "not a file": (("<robot name='five-bar'>", "<mujoco>"), {}, "is not XML"),
+    "axis": (("0 1 0", "0 0 0"), {}, "axis of the joint 'left shoulder' is zero"),
+    "two parents": (
+        ("</robot>", cases.joint("j", "revolute", "base", "left tip") + "</robot>"),
+        {},
+        r"\['left tip'\] are children of several joints",
+    ),
+    "inertia": (('iyy="0.004"', 'iyy="-0.004"'), {}, "'left upper': `inertia` must be positive definite"),
+    "number": (('mass value="0.8"', 'mass value="much"'), {}, "'value' of the link 'left upper' must be a number"),
+    "no such link": ((), {"closures": {"closed_loop": [["tip", "top"]], "type": ["6d"]}}, r"has \['top'\]"),
+    "type": ((), {"closures": {"closed_loop": [["left tip", "right tip"]], "type": ["5d"]}}, "'3d' .* or '6d'"),
+    "entries": ((), {"closures": {"loops": []}}, r"entries \['loops'\]"),
+    "ball motor": (
+        (),
+        {"closures": cases.CLOSURES | {"joint_name": ["tip"], "joint_type": ["SPHERICAL"], "name_mot": ["tip"]}},
+        r"'name_mot' has \['tip'\]",
+    ),
+    "no motors": ((), {"closures": cases.CLOSURES | {"name_mot": []}}, "`control` needs motors"),
+    "configuration": ((), {"configuration": {"elbow": 1.0}}, "'elbow', which is no hinge or slider"),
+    "ignored": ((), {"ignore": ("mass",)}, r"`ignore` has \['mass'\]"),
+}
+
+
+@pytest.mark.parametrize("case", CHANGES)
+def test_messages_name_what_is_wrong(case):
+    change, options, message = CHANGES[case]
+    file = cases.five_bar()
+    if change:
+        assert change[0] in file
+        file = file.replace(*change)
+    given = dict(closures=cases.CLOSURES, configuration=cases.START, control=lambda t, args: args)
+    with pytest.raises((TypeError, ValueError), match=message):
+        mb.read_urdf(file, **(given | options))

@@ -98,7 +98,7 @@ class Assembly(eqx.Module):
         """Masses, constraints and forces as a [`MechanicalSystem`][], which has the `terms`, the
         manifold `constraint` and the `multipliers`."""
         rows = None if self.independent is None else self.independent.rows
-        return system_of(ConstantAssembly(self), self.redundant, rows)
+        return system_of(ConstantAssembly(self), self.redundant and rows is None, rows)
 
     def without_dependent_equations(self) -> "Assembly":
         """Return the assembly with as many equations of its joints as are independent, for closed loops whose
