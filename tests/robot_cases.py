@@ -41,8 +41,7 @@ def five_bar():
     limit = '<limit lower="-2" upper="1.5" effort="0" velocity="0"/>'
     parts = [link("base", 1.0, 0.1)]
     for side, x in (("left", 0.0), ("right", BASE)):
-        lengths, centers = LENGTHS[side], CENTERS[side]
-        masses, inertias = MASSES[side], INERTIAS[side]
+        centers, masses, inertias = CENTERS[side], MASSES[side], INERTIAS[side]
         upper, lower = f"{side} upper", f"{side} lower"
         parts += [
             link(upper, masses[0], inertias[0], centers[0]),

@@ -44,7 +44,7 @@ def test_light_beside_heavy_bodies():
     flat = planar.system.accelerations(0.0, cases.four_bar_state(planar, problem.y0), args)
     loop = cases.four_bar_in_space(args, problem.y0, redundant=True)
     fewer = loop.without_dependent_equations()
-    q, v = (np.asarray(part).reshape(3, 3) for part in problem.y0)
+    _, v = (np.asarray(part).reshape(3, 3) for part in problem.y0)
     of_bodies = lambda rows: dict(zip(cases.BARS, rows, strict=True))
     in_space = lambda v: np.array([v[0], 0.0, v[1]])
     y = loop.state(
@@ -52,20 +52,28 @@ def test_light_beside_heavy_bodies():
         angular_velocities=of_bodies([(0.0, -row[2], 0.0) for row in v]),
     )
     a = fewer.system.accelerations(0.0, y, None)
-    np.testing.assert_allclose(a.position[:, ::2], flat.position, rtol=1e-8)  # rounding times the ratio
+    np.testing.assert_allclose(
+        a.position[:, ::2], flat.position, rtol=1e-8
+    )  # rounding times the ratio
     # What the ground exerts, and the weight, change the momentum of all bodies.
     forces = fewer.joint_forces(0.0, y)
-    ground = sum(np.asarray(forces[f"Revolute {name}-ground"].force) for name in ("crank", "rocker"))
+    ground = sum(
+        np.asarray(forces[f"Revolute {name}-ground"].force) for name in ("crank", "rocker")
+    )
     mass = np.asarray(args.masses)[:, None]
     weight = mass.sum() * np.array([0.0, 0.0, -float(args.gravity)])
-    np.testing.assert_allclose(weight - ground, np.sum(mass * a.position, axis=0), rtol=1e-8, atol=1e-8)
+    np.testing.assert_allclose(
+        weight - ground, np.sum(mass * a.position, axis=0), rtol=1e-8, atol=1e-8
+    )
 
 
 def test_drives_are_kept():
     """A crank that is turned as prescribed: none of its equations is left out."""
     problem = mj.problems.four_bar()
     drive = mb.Drive("Revolute crank-ground", lambda t, args: args * t**2)
-    driven = cases.four_bar_in_space(problem.args, problem.y0, [drive]).without_dependent_equations()
+    driven = cases.four_bar_in_space(
+        problem.args, problem.y0, [drive]
+    ).without_dependent_equations()
     # 20 of joints and norms are independent, and one of the drive.
     assert len(driven.independent.rows) == 21
     args, y = jnp.asarray(0.3), driven.state(args=0.3)
@@ -79,7 +87,12 @@ def test_drives_are_kept():
 def test_singular_drawings_and_traced_numbers_are_refused():
     bar = lambda name, x, length: mb.Body(name, 1.0, length**2 / 12, position=(x, 0.0))
     bodies = [bar("crank", 0.5, 1.0), bar("coupler", 2.0, 2.0), bar("rocker", 2.5, 1.0)]
-    pins = (("crank", mb.GROUND, 0), ("crank", "coupler", 1), ("coupler", "rocker", 3), ("rocker", mb.GROUND, 2))
+    pins = (
+        ("crank", mb.GROUND, 0),
+        ("crank", "coupler", 1),
+        ("coupler", "rocker", 3),
+        ("rocker", mb.GROUND, 2),
+    )
     joints = [mb.Revolute(a, b, at=(float(x), 0.0)) for a, b, x in pins]
     folded = mb.Assembly(bodies, joints)  # a parallelogram in one line
     with pytest.raises(ValueError, match="1 of the 8 equations .* in the drawing, and 0 nearby"):

@@ -27,17 +27,26 @@ def robot():
 
 def angles_of(robot, y):
     """Of upper and lower links from the vertical, in the frames of the file."""
-    rotations = (robot.frame(y, f"{side} {part}")[1] for side in ("left", "right") for part in ("upper", "lower"))
+    rotations = (
+        robot.frame(y, f"{side} {part}")[1]
+        for side in ("left", "right")
+        for part in ("upper", "lower")
+    )
     return np.array([np.arctan2(R[0, 2], R[2, 2]) for R in map(np.asarray, rotations)])
 
 
 def textbook(angles, rates, torques):
     """Accelerations of the four angles."""
-    arms = [cases.arm(side, angles[i : i + 2], rates[i : i + 2]) for i, side in ((0, "left"), (2, "right"))]
+    arms = [
+        cases.arm(side, angles[i : i + 2], rates[i : i + 2])
+        for i, side in ((0, "left"), (2, "right"))
+    ]
     M, J = np.zeros((4, 4)), np.hstack([arms[0][2], -arms[1][2]])
     M[:2, :2], M[2:, 2:] = arms[0][0], arms[1][0]
     braking = cases.DAMPING * (rates[3] - rates[2])
-    force = np.array([torques[0], 0, torques[1] + braking, -braking]) - np.concatenate([arms[0][1], arms[1][1]])
+    force = np.array([torques[0], 0, torques[1] + braking, -braking]) - np.concatenate(
+        [arms[0][1], arms[1][1]]
+    )
     system = np.block([[M, J.T], [J, np.zeros((2, 2))]])
     return np.linalg.solve(system, np.concatenate([force, arms[1][3] - arms[0][3]]))[:4]
 
@@ -48,7 +57,7 @@ def test_accelerations_are_those_of_the_textbook(robot):
     )
     angles = angles_of(robot, y)
     assert np.allclose(cases.tip("left", angles[:2]), cases.tip("right", angles[2:]), atol=1e-14)
-    assert angles[0] == pytest.approx(-0.6, abs=1e-14) and angles[2] == pytest.approx(0.5, abs=1e-14)
+    np.testing.assert_allclose(angles[[0, 2]], [-0.6, 0.5], atol=1e-14)
     names = ("left upper", "left lower", "right upper", "right lower")
     spins = lambda y: jnp.stack([robot.assembly.motion(y, name).angular_velocity for name in names])
     a = robot.assembly.system.accelerations(0.0, y, TORQUES)
@@ -127,12 +136,22 @@ def test_a_free_base_falls():
 
 
 CHANGES = {  # of the file and the arguments, and what is said
-    "gap": (("0 0 0.4", "0 0 1.4"), {}, r"loops cannot be closed: left tip-right tip \(gap 0\.\d+\)"),
-    "pose": ((), {"configuration": {"left shoulder": -1.5, "right shoulder": 1.5}}, "cannot be closed"),
+    "gap": (
+        ("0 0 0.4", "0 0 1.4"),
+        {},
+        r"loops cannot be closed: left tip-right tip \(gap 0\.\d+\)",
+    ),
+    "pose": (
+        (),
+        {"configuration": {"left shoulder": -1.5, "right shoulder": 1.5}},
+        "cannot be closed",
+    ),
     "three joints": (
         (
             '<link name="first"/>',
-            '<link name="first"/>' + cases.link("flap", 0.1, 0.1) + cases.joint("j", "revolute", "first", "flap"),
+            '<link name="first"/>'
+            + cases.link("flap", 0.1, 0.1)
+            + cases.joint("j", "revolute", "first", "flap"),
         ),
         {},
         "'first' has no mass, but joins 'about x', 'j', 'about y'",
@@ -146,18 +165,41 @@ CHANGES = {  # of the file and the arguments, and what is said
         {},
         r"\['left tip'\] are children of several joints",
     ),
-    "inertia": (('iyy="0.004"', 'iyy="-0.004"'), {}, "'left upper': `inertia` must be positive definite"),
-    "number": (('mass value="0.8"', 'mass value="much"'), {}, "'value' of the link 'left upper' must be a number"),
-    "no such link": ((), {"closures": {"closed_loop": [["tip", "top"]], "type": ["6d"]}}, r"has \['top'\]"),
-    "type": ((), {"closures": {"closed_loop": [["left tip", "right tip"]], "type": ["5d"]}}, "'3d' .* or '6d'"),
+    "inertia": (
+        ('iyy="0.004"', 'iyy="-0.004"'),
+        {},
+        "'left upper': `inertia` must be positive definite",
+    ),
+    "number": (
+        ('mass value="0.8"', 'mass value="much"'),
+        {},
+        "'value' of the link 'left upper' must be a number",
+    ),
+    "no such link": (
+        (),
+        {"closures": {"closed_loop": [["tip", "top"]], "type": ["6d"]}},
+        r"has \['top'\]",
+    ),
+    "type": (
+        (),
+        {"closures": {"closed_loop": [["left tip", "right tip"]], "type": ["5d"]}},
+        "'3d' .* or '6d'",
+    ),
     "entries": ((), {"closures": {"loops": []}}, r"entries \['loops'\]"),
     "ball motor": (
         (),
-        {"closures": cases.CLOSURES | {"joint_name": ["tip"], "joint_type": ["SPHERICAL"], "name_mot": ["tip"]}},
+        {
+            "closures": cases.CLOSURES
+            | {"joint_name": ["tip"], "joint_type": ["SPHERICAL"], "name_mot": ["tip"]}
+        },
         r"'name_mot' has \['tip'\]",
     ),
     "no motors": ((), {"closures": cases.CLOSURES | {"name_mot": []}}, "`control` needs motors"),
-    "configuration": ((), {"configuration": {"elbow": 1.0}}, "'elbow', which is no hinge or slider"),
+    "configuration": (
+        (),
+        {"configuration": {"elbow": 1.0}},
+        "'elbow', which is no hinge or slider",
+    ),
     "ignored": ((), {"ignore": ("mass",)}, r"`ignore` has \['mass'\]"),
 }
 

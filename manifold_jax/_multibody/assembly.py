@@ -313,5 +313,9 @@ def _all_multipliers(
     multipliers = assembly.system.multipliers(t, y, args)
     if assembly.independent is None:
         return multipliers
-    size = sum(part.size for part in residuals(assembly.joints_at(t, args), y[0])) + len(assembly.names)
-    return jnp.zeros(size, multipliers.dtype).at[np.array(assembly.independent.rows)].set(multipliers)
+    size = sum(part.size for part in residuals(assembly.joints_at(t, args), y[0])) + len(
+        assembly.names
+    )
+    return (
+        jnp.zeros(size, multipliers.dtype).at[np.array(assembly.independent.rows)].set(multipliers)
+    )

@@ -64,4 +64,6 @@ def _spans(first: Joint, second: Joint, third: Joint) -> bool:
     first nor to the third."""
     across = lambda a, b: np.linalg.norm(np.cross(a, b)) > 1e-3
     inner = third.origin.rotation @ third.axis
-    return bool(across(first.axis, second.origin.rotation @ second.axis) and across(second.axis, inner))
+    return bool(
+        across(first.axis, second.origin.rotation @ second.axis) and across(second.axis, inner)
+    )

@@ -93,7 +93,10 @@ def motions_of(joint: Joint, joint_types: Mapping[str, str]) -> list[Motion]:
     if kind == "FIXED":
         return []
     axes = "XYZ" if kind == "SPHERICAL" else kind.removeprefix("UJOINT_")
-    if not (kind == "SPHERICAL" or (kind.startswith("UJOINT_") and len(axes) == 2 and set(axes) <= set("XYZ"))):
+    if not (
+        kind == "SPHERICAL"
+        or (kind.startswith("UJOINT_") and len(axes) == 2 and set(axes) <= set("XYZ"))
+    ):
         raise ValueError(
             f"`closures`: the type of the joint {joint.name!r} must be 'SPHERICAL', 'FIXED' or 'UJOINT_XY' (two different "
             f"axes of its frame), got {kind!r}."

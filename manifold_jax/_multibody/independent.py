@@ -50,7 +50,7 @@ def find_independent(assembly: Any) -> Independent | None:
         return None
     weighted = _weighted(assembly.bodies, J)
     sizes = np.maximum(np.linalg.norm(weighted, axis=1, keepdims=True), np.finfo(J.dtype).tiny)
-    _, order = scipy.linalg.qr((weighted / sizes).T, mode="r", pivoting=True)
+    *_, order = scipy.linalg.qr((weighted / sizes).T, mode="r", pivoting=True)
     chosen = np.sort(order[: J.shape[0] - number])
     joints = J.shape[0] - (0 if assembly.bodies.planar else len(assembly.names))
     # The equations of drives, which are all solved, are between those of joints and the norms.

@@ -35,19 +35,24 @@ def close_loops(
     """Return coordinates for which all loops are closed, found from `x` or, where that fails, from starts
     beside it; those `held` stay."""
     free = np.setdiff1d(np.arange(tree.size), held)
-    random, given, rest, best = np.random.default_rng(0), x, dict(tree.rest), None
+    random, rest = np.random.default_rng(0), tree.rest
+    found, trial = [], x
     for _ in range(_STARTS):
-        x, gap = _descend(tree, closures, x.copy(), free)
-        size = np.abs(gap).max(initial=0)
-        if best is None or size < best[0]:
-            best = size, x, tree.rest
-        if size <= _CLOSED:
+        tree.rest = dict(rest)
+        trial, gap = _descend(tree, closures, trial.copy(), free)
+        found.append((np.abs(gap).max(initial=0), trial, tree.rest))
+        if found[-1][0] <= _CLOSED:
             break
-        tree.rest, x = dict(rest), given.copy()
-        x[free] += random.normal(scale=_SPREAD, size=free.size)
-    _, x, tree.rest = best
+        trial = x.copy()
+        trial[free] += random.normal(scale=_SPREAD, size=free.size)
+    _, x, tree.rest = min(found, key=lambda one: one[0])
     _check_closed(tree, closures, x)
-    return x
+    return np.where(_is_free_angle(tree, free), (x + np.pi) % (2 * np.pi) - np.pi, x)
+
+
+def _is_free_angle(tree: KinematicTree, free: np.ndarray) -> np.ndarray:
+    turns = [motion.turns for joint in tree.order for motion in tree.motions[joint.name]]
+    return np.array(turns, bool) & np.isin(np.arange(tree.size), free)
 
 
 def _descend(

@@ -127,7 +127,9 @@ def _without(found: list[Connection], group: str, groups: Groups) -> list[Connec
     name = f"{one.name} {other.name}"
     place = found.index(own[0])
     merged = Connection(name, one.first, other.second, one.axes + other.axes)
-    return [c for c in found[:place] if c in rest] + [merged] + [c for c in found[place:] if c in rest]
+    return (
+        [c for c in found[:place] if c in rest] + [merged] + [c for c in found[place:] if c in rest]
+    )
 
 
 def joint_between(connection: Connection, names: Mapping[str, str]) -> AbstractJoint:
@@ -142,7 +144,11 @@ def joint_between(connection: Connection, names: Mapping[str, str]) -> AbstractJ
         return kind(first, second, axis=a.direction, **given)
     one_point = all(np.linalg.norm(axis.at - a.at) < _ROUNDING for axis in others)
     directions = np.stack([axis.direction for axis in axes])
-    if len(turning) == len(axes) == 2 and one_point and abs(directions[0] @ directions[1]) < _ROUNDING:
+    if (
+        len(turning) == len(axes) == 2
+        and one_point
+        and abs(directions[0] @ directions[1]) < _ROUNDING
+    ):
         # perpendicular to the last digit, as the joint wants them
         aligned = directions[1] - directions[0] * (directions[0] @ directions[1])
         return Universal(first, second, axis=(directions[0], aligned), **given)
@@ -167,4 +173,3 @@ def body_names(groups: Groups, root: str, moves: bool) -> dict[str, str]:
         if groups.mass(group) != 0 and group != root
     }
     return {root: groups.body_name(root) if moves else GROUND, **names}
-

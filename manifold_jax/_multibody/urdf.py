@@ -220,7 +220,11 @@ def _dampers(elements: Sequence[Joint], joints: Sequence[AbstractJoint]) -> list
             f"`file` gives damping to {', '.join(lost)}, which is part of a joint with several coordinates or does not "
             "move. Remove it, and add a `Damper` or `Torque` by `forces`."
         )
-    return [JointSpring(j.name, damping=j.damping, name=f"damping of {j.name}") for j in damped]
+    found: list[Any] = [
+        JointSpring(joint.name, damping=joint.damping, name=f"damping of {joint.name}")  # pyright: ignore[reportCallIssue]
+        for joint in damped
+    ]
+    return found
 
 
 def _motors(
@@ -230,14 +234,18 @@ def _motors(
         return []
     check_function("control", control, "f(t, args)")
     if not motors:
-        raise ValueError("`control` needs motors: name their joints in `closures`, {'name_mot': [...]}.")
+        raise ValueError(
+            "`control` needs motors: name their joints in `closures`, {'name_mot': [...]}."
+        )
     single = {joint.name for joint in joints if isinstance(joint, Revolute | Prismatic)}
     if passive := [name for name in motors if name not in single]:
         raise ValueError(
             f"`closures`: 'name_mot' has {passive}, which have no single coordinate for a torque or force: motors belong to "
             "hinges and sliders between links with mass."
         )
-    return [Motor(name, _Control(control, i, len(motors))) for i, name in enumerate(motors)]
+    values = [_Control(control, i, len(motors)) for i in range(len(motors))]
+    found: list[Any] = [Motor(*pair) for pair in zip(motors, values, strict=True)]  # pyright: ignore[reportCallIssue]
+    return found
 
 
 class _Control(eqx.Module):

@@ -138,9 +138,7 @@ def _axis(element: ElementTree.Element, kind: str, what: str) -> np.ndarray:
     return axis / length
 
 
-def _linked(
-    element: ElementTree.Element, end: str, what: str, links: dict[str, Link]
-) -> str:
+def _linked(element: ElementTree.Element, end: str, what: str, links: dict[str, Link]) -> str:
     found = element.find(end)
     if found is None:
         raise ValueError(f"`file`: {what} has no <{end}>.")
