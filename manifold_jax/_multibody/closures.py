@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from .._base.extras import require
-from .kinematic_tree import Motion
+from .kinematic_tree import DegreeOfFreedom
 from .loops import Closure
 from .urdf_elements import BALL, Joint
 
@@ -83,13 +83,13 @@ def _closure(pair: Any, kind: Any, frames: Mapping[str, str]) -> Closure:
     return Closure(f"{first}-{second}", frames[first], frames[second], is_rigid)
 
 
-def motions_of(joint: Joint, joint_types: Mapping[str, str]) -> list[Motion]:
+def motions_of(joint: Joint, joint_types: Mapping[str, str]) -> list[DegreeOfFreedom]:
     """Return the degrees of freedom of a joint: of its type in the file, or of that in `closures`."""
     kind = "SPHERICAL" if joint.kind == BALL else joint_types.get(joint.name)
     if kind is None:
         if joint.kind in ("fixed", "floating"):
             return []
-        return [Motion(joint.kind != "prismatic", joint.axis)]
+        return [DegreeOfFreedom(joint.kind != "prismatic", joint.axis)]
     if kind == "FIXED":
         return []
     axes = "XYZ" if kind == "SPHERICAL" else kind.removeprefix("UJOINT_")
@@ -101,4 +101,4 @@ def motions_of(joint: Joint, joint_types: Mapping[str, str]) -> list[Motion]:
             f"`closures`: the type of the joint {joint.name!r} must be 'SPHERICAL', 'FIXED' or 'UJOINT_XY' (two different "
             f"axes of its frame), got {kind!r}."
         )
-    return [Motion(True, _AXES[axis]) for axis in axes]
+    return [DegreeOfFreedom(True, _AXES[axis]) for axis in axes]

@@ -8,7 +8,7 @@ import numpy as np
 from .urdf_elements import about, Joint, Link, Placement
 
 
-class Motion(NamedTuple):
+class DegreeOfFreedom(NamedTuple):
     """One degree of freedom: a turn about an axis or a shift along it, in the frame of its joint."""
 
     turns: bool
@@ -28,7 +28,10 @@ class KinematicTree:
     """
 
     def __init__(
-        self, links: dict[str, Link], joints: Sequence[Joint], motions: Mapping[str, list[Motion]]
+        self,
+        links: dict[str, Link],
+        joints: Sequence[Joint],
+        motions: Mapping[str, list[DegreeOfFreedom]],
     ):
         self.links, self.motions = links, motions
         self.joint_of = {joint.child: joint for joint in joints}
