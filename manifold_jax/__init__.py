@@ -7,6 +7,8 @@ from ._applications import (
     ConstrainedMinimum as ConstrainedMinimum,
     CurveTrace as CurveTrace,
     gradient_flow as gradient_flow,
+    Linearization as Linearization,
+    linearize as linearize,
     trace_curve as trace_curve,
 )
 from ._constraint.constraint import (

@@ -5,6 +5,7 @@ from ._multibody import (
     AbstractJoint as AbstractJoint,
     Assembly as Assembly,
     Body as Body,
+    Controller as Controller,
     Cylindrical as Cylindrical,
     Damper as Damper,
     Distance as Distance,

@@ -4,6 +4,7 @@ from .assembly import Assembly as Assembly
 from .bodies import Body as Body, GROUND as GROUND, Pose as Pose
 from .forces import (
     AbstractForce as AbstractForce,
+    Controller as Controller,
     Damper as Damper,
     Force as Force,
     JointSpring as JointSpring,

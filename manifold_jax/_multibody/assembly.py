@@ -47,7 +47,7 @@ class Assembly(eqx.Module):
         [`Prismatic`][], [`Cylindrical`][], [`Universal`][], [`Fixed`][], [`Distance`][], and [`Drive`][]
         where their motion is prescribed.
     - `forces`: [`Spring`][], [`Damper`][], [`JointSpring`][], [`Motor`][],
-        [`LinearActuator`][], [`Force`][], [`Torque`][].
+        [`LinearActuator`][], [`Controller`][], [`Force`][], [`Torque`][].
     - `gravity` (m/s^2): shape `(2,)` or `(3,)`; `None` for none.
     - `redundant`: whether equations of joints depend on each other, as in most closed loops in
         space that move in a plane. `Assembly.state` says so.

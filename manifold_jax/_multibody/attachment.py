@@ -120,6 +120,7 @@ def name_all(given: Any, base: type, what: str) -> list[tuple[Any, str]]:
         name = thing.name
         if name is None:
             own = [getattr(thing, part, None) for part in ("first", "second", "body", "joint")]
+            own += getattr(thing, "joints", ())
             name = " ".join([type(thing).__name__, "-".join(str(part) for part in own if part)])
             count[name] = count.get(name, 0) + 1
             name = name if count[name] == 1 else f"{name} ({count[name]})"

@@ -104,6 +104,29 @@ class Motor(AbstractJointForce):
     name: str | None = eqx.field(static=True, default=None)
 
 
+class Controller(AbstractForce):
+    """A feedback controller: torques (N m) and forces (N) in several hinges and sliders that depend on the
+    state of the whole mechanism.
+
+    ```python
+    mb.Controller(("shoulder", "elbow"), lambda t, y, args: -args @ near.coordinates(y))
+    ```
+
+    **Arguments:**
+
+    - `joints`: the names of [`Revolute`][] and [`Prismatic`][] joints, `k` of them.
+    - `law`: `f(t, y, args)` returns the values `(k,)`, with signs as for [`Motor`][]; `y = (q, v)` is the
+        state of the solve.
+    - `name`: by default made from the names of the joints.
+
+    Its torques are not part of `Assembly.energy`. For values that do not depend on the state use [`Motor`][].
+    """
+
+    joints: tuple[str, ...] = eqx.field(static=True, converter=tuple)
+    law: Any
+    name: str | None = eqx.field(static=True, default=None)
+
+
 class Force(AbstractForce):
     """A force on a body, in world coordinates.
 

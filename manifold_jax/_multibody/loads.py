@@ -1,6 +1,7 @@
 """Loads: the effects of forces on the bodies, all of one kind in one array computation."""
 
 import abc
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -9,10 +10,11 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._base.types import Args, FloatScalar, RealScalarLike
+from .._base.user_functions import check_function
 from . import forces, joints
 from .attachment import attach, Attachment, grouped, name_all
-from .bodies import Bodies
-from .checks import check_shape, is_concrete, stack, Values
+from .bodies import Bodies, Pose
+from .checks import check_shape, floating, is_concrete, stack, Values
 from .equations import DRIVEN
 from .frames import Frames, in_space, Vectors
 from .joint_groups import attachment_of, find_joint, Found, JointGroup
@@ -21,14 +23,16 @@ from .rotations import dot, length_of, turn
 
 _ADVICE = "Springs and motors belong to `Revolute` and `Prismatic` joints; between points use `Spring` and `LinearActuator`."
 Wrench = tuple[Float[Array, "n 3"], Float[Array, "n 3"]]  # forces, torques about the origins
+State = tuple[Pose, Pose]
 
 
 class AbstractLoads(eqx.Module):
     """All forces of one kind."""
 
     @abc.abstractmethod
-    def wrench(self, t: RealScalarLike, frames: Frames, args: Args) -> Wrench:
-        """Return forces and torques on the bodies and, last, the ground."""
+    def wrench(self, t: RealScalarLike, y: State, frames: Frames, args: Args) -> Wrench:
+        """Return forces and torques on the bodies and, last, the ground, in the state `y` with these
+        `frames`."""
 
     @abc.abstractmethod
     def potential(self, frames: Frames) -> FloatScalar:
@@ -62,7 +66,7 @@ class LineLoads(AbstractLoads):
     attachment: Attachment
     laws: SpringLaws
 
-    def wrench(self, t: RealScalarLike, frames: Frames, args: Args) -> Wrench:
+    def wrench(self, t: RealScalarLike, y: State, frames: Frames, args: Args) -> Wrench:
         sides = self.attachment.sides(frames)
         velocities = self.attachment.velocities(frames, sides)
         pull = self._pull(t, sides.gap, velocities, args)
@@ -97,7 +101,7 @@ class JointLoads(AbstractLoads):
     attachment: Attachment
     laws: SpringLaws
 
-    def wrench(self, t: RealScalarLike, frames: Frames, args: Args) -> Wrench:
+    def wrench(self, t: RealScalarLike, y: State, frames: Frames, args: Args) -> Wrench:
         sides = self.attachment.sides(frames)
         axis = sides.frame_first[:, :, 2]
         first, second = self.attachment.index
@@ -125,7 +129,7 @@ class BodyLoads(AbstractLoads):
     points: Float[Array, "k 3"]
     values: Values
 
-    def wrench(self, t: RealScalarLike, frames: Frames, args: Args) -> Wrench:
+    def wrench(self, t: RealScalarLike, y: State, frames: Frames, args: Args) -> Wrench:
         index, value = np.asarray(self.bodies), self.values.at(t, args)
         if value.ndim == 1:  # about the normal of the plane
             value = jnp.pad(value[:, None], ((0, 0), (2, 0)))
@@ -134,6 +138,32 @@ class BodyLoads(AbstractLoads):
             return apply(frames, index, frames.origin[index], none, value)
         arm = turn(frames.rotation[index], self.points)
         return apply(frames, index, frames.origin[index] + arm, value, none)
+
+    def potential(self, frames: Frames) -> FloatScalar:
+        return jnp.zeros((), frames.origin.dtype)
+
+
+class ControlledLoads(AbstractLoads):
+    """Loads of one controller in hinges and sliders."""
+
+    hinges: tuple[bool, ...] = eqx.field(static=True)
+    attachment: Attachment
+    law: Callable
+
+    def wrench(self, t: RealScalarLike, y: State, frames: Frames, args: Args) -> Wrench:
+        values = floating(self.law(t, y, args))
+        if values.shape != (len(self.hinges),):
+            raise ValueError(
+                f"`law` of a `Controller` must return one value for each of its joints, shape ({len(self.hinges)},), got "
+                f"{values.shape}."
+            )
+        sides = self.attachment.sides(frames)
+        push = values[:, None] * sides.frame_first[:, :, 2]
+        turns = np.array(self.hinges)[:, None]
+        force, torque = jnp.where(turns, 0, push), jnp.where(turns, push, 0)
+        first, second = self.attachment.index
+        on_second = apply(frames, second, sides.second, force, torque)
+        return add(on_second, apply(frames, first, sides.second, -force, -torque))
 
     def potential(self, frames: Frames) -> FloatScalar:
         return jnp.zeros((), frames.origin.dtype)
@@ -150,18 +180,35 @@ def add(a: Wrench, b: Wrench) -> Wrench:
     return a[0] + b[0], a[1] + b[1]
 
 
-_ADVICE = "Springs and motors belong to `Revolute` and `Prismatic` joints; between points use `Spring` and `LinearActuator`."
-
-
 def group_forces(
     bodies: Bodies, groups: tuple[JointGroup, ...], given: Any
 ) -> tuple[AbstractLoads, ...]:
     in_joint = lambda force: isinstance(force, forces.AbstractJointForce)
+    everything = name_all(given, forces.AbstractForce, "force")
     named = [
         (force, name, find_joint(groups, force.joint, name, _ADVICE) if in_joint(force) else None)
-        for force, name in name_all(given, forces.AbstractForce, "force")
+        for force, name in everything
+        if not isinstance(force, forces.Controller)
     ]
-    return tuple(_loads(kind, bodies, *own) for kind, own in grouped(named, _kind).items())
+    controlled = [
+        _controlled(groups, force, name)
+        for force, name in everything
+        if isinstance(force, forces.Controller)
+    ]
+    kinds = grouped(named, _kind).items()
+    return (*(_loads(kind, bodies, *own) for kind, own in kinds), *controlled)
+
+
+def _controlled(
+    groups: tuple[JointGroup, ...], controller: forces.Controller, name: str
+) -> ControlledLoads:
+    check_function(f"law` of `{name}", controller.law, "f(t, y, args)")
+    if not controller.joints:
+        raise ValueError(f"{name}: `joints` must name at least one hinge or slider.")
+    advice = "Controllers belong to `Revolute` and `Prismatic` joints."
+    found = tuple(find_joint(groups, joint, name, advice) for joint in controller.joints)
+    hinges = tuple(group.kind is joints.Revolute for group, _ in found)
+    return ControlledLoads(hinges, attachment_of(found, controller.joints), controller.law)
 
 
 def _kind(force: Any, name: str, found: Found | None) -> type:

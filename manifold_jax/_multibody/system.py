@@ -67,7 +67,7 @@ class _Forces(eqx.Module):
         weight = assembly.bodies.mass[:, None] * assembly.gravity[None, :]
         total = jnp.pad(weight, ((0, 1), (0, 0))), jnp.zeros_like(frames.origin)
         for loads in assembly.loads:
-            total = add(total, loads.wrench(t, frames, args))
+            total = add(total, loads.wrench(t, (q, v), frames, args))
         force, torque = total[0][:-1], total[1][:-1]
         if q.planar:
             return Pose(force[:, :2], torque[:, 2])
