@@ -31,6 +31,8 @@ class Linearization(eqx.Module):
     - `by_args`: the derivatives of `z'` by the numbers in `args`, `(d, ...)` for each leaf: the columns of
         the input matrix `B` for leaves that are inputs.
     - `basis`: the tangent vectors `T`, orthonormal columns `(n, d)`; rows in the order of `ravel_pytree(y)`.
+        Which basis it is has no meaning: positions and velocities are mixed. Weights `Q` of all components
+        of `y` are `T^T Q T` for `z`.
     - `y`: the state.
     """
 
