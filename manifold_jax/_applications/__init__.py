@@ -1,3 +1,3 @@
 from .curve import CurveTrace as CurveTrace, trace_curve as trace_curve
-from .linearize import Linearization as Linearization, linearize as linearize
+from .linearization import Linearization as Linearization, linearize as linearize
 from .optimization import ConstrainedMinimum as ConstrainedMinimum, gradient_flow as gradient_flow
