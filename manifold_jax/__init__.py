@@ -63,6 +63,7 @@ from ._solver.stabilization import (
     InvariantStabilization as InvariantStabilization,
 )
 from ._solver.tangent import tangent_field as tangent_field
+from ._sympy import from_sympy as from_sympy, SymbolicSystem as SymbolicSystem
 
 
 # isort: split

@@ -1,0 +1,162 @@
+"""A model of SymPy as a vector field on a manifold."""
+
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from .._base.errors import clear_errors
+from .._base.numbers import numbers_as_arrays
+from .._base.types import Args, RealScalarLike, Y
+from .._constraint.constraint import AbstractConstraint, NoConstraint
+from .._constraint.diagnosis import Diagnosis
+from .._constraint.settings import NewtonProjection
+from .._mechanics import MechanicalSystem
+from .equations import name_of
+from .function import SymbolicFunction
+
+
+class Model(NamedTuple):
+    """The symbols of the coordinates, the speeds and the parameters, and those of the first two that Kane's
+    method calls dependent."""
+
+    q: tuple[Any, ...]
+    u: tuple[Any, ...]
+    parameters: tuple[Any, ...]
+    dependent: tuple[Any, ...]
+
+
+class SymbolicSystem(eqx.Module):
+    """The equations of motion of a SymPy model, made by [`from_sympy`][].
+
+    - `terms`, `constraint`: the vector field on the state `(q, u)`, and its manifold.
+    - `mechanics`: the same as a [`MechanicalSystem`][], which has multipliers, impacts and symplectic steps; `None`
+        if it is not one. It is one for a `LagrangesMethod` with constraints whose masses depend on coordinates and
+        parameters alone, and whose constraints have no inputs.
+    """
+
+    terms: dfx.AbstractTerm
+    constraint: AbstractConstraint
+    mechanics: MechanicalSystem | None
+    inputs: dict[str, Callable]
+    model: Model = eqx.field(static=True)
+
+    @property
+    def coordinates(self) -> tuple[str, ...]:
+        """The names of the numbers in `q`."""
+        return tuple(map(name_of, self.model.q))
+
+    @property
+    def speeds(self) -> tuple[str, ...]:
+        """The names of the numbers in `u`; of Lagrange's method `"x'"`."""
+        return tuple(map(name_of, self.model.u))
+
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        """The names that `args` must have."""
+        return tuple(map(str, self.model.parameters))
+
+    def args(self, values: Mapping[Any, Any]) -> dict[str, Any]:
+        """Return `args` from a dictionary by symbol: `{m: 1.0}` becomes `{"m": 1.0}`.
+
+        Names as keys are allowed, too, also those of additional numbers that only inputs need.
+
+        **Raises:**
+
+        `ValueError` for symbols without a value, and for symbols that the equations do not contain.
+        """
+        unknown = [
+            str(key)
+            for key in values
+            if not isinstance(key, str) and str(key) not in self.parameters
+        ]
+        if unknown:
+            raise ValueError(
+                f"The equations do not contain {', '.join(unknown)}. Their symbols are {', '.join(self.parameters)}; numbers "
+                "for inputs alone have strings as keys."
+            )
+        named = {str(key): value for key, value in values.items()}
+        missing = [name for name in self.parameters if name not in named]
+        if missing:
+            raise ValueError(f"`values` has no number for {', '.join(missing)}.")
+        return named
+
+    def state(
+        self, values: Mapping[Any, Any], args: Args = None, *, t: RealScalarLike = 0.0
+    ) -> tuple[jax.Array, jax.Array]:
+        """Return a consistent state `(q, u)`.
+
+        **Arguments:**
+
+        - `values`: numbers for coordinates and speeds, by symbol or by name; zero where there is none.
+        - `args`, `t`: passed to the constraints.
+
+        Kane's method: the independent coordinates and speeds keep their values, the dependent ones
+        are solved for, from `values` as a guess. Lagrange's method: the nearest consistent state, as
+        by [`consistent_state`][]. Works under `jit`, `vmap` and derivatives.
+
+        **Raises:**
+
+        `ValueError` for names that are neither; a `RuntimeError` if no state is found near the guess.
+        """
+        y = self._named_state(values)
+        if isinstance(self.constraint, NoConstraint):
+            return y
+        return _consistent(self.constraint, self._only_dependent(), t, y, args)
+
+    def function(self, expression: Any) -> Callable[[RealScalarLike, Y, Args], jax.Array]:
+        """Return a further expression of the model, such as its energy or the position of a point, as a
+        function `f(t, y, args)`: for [`Invariants`][], events, inputs, or pictures.
+
+        **Arguments:**
+
+        - `expression`: an expression, or a matrix, of coordinates, speeds, parameters and inputs. A column
+            becomes an array of shape `(n,)`.
+        """
+        inner = SymbolicFunction.of((expression,), self.model.q, self.model.u, self.inputs)
+        return lambda t, y, args: inner(t, y, args)[0]
+
+    def _only_dependent(self) -> tuple[np.ndarray, np.ndarray] | None:
+        """Return the metric in which corrections move the dependent numbers alone: infinite weights of others."""
+        if not self.model.dependent:
+            return None
+        weight = lambda symbols: np.array(
+            [1.0 if x in self.model.dependent else np.inf for x in symbols]
+        )
+        return weight(self.model.q), weight(self.model.u)
+
+    def _named_state(self, values: Mapping[Any, Any]) -> tuple[jax.Array, jax.Array]:
+        names = self.coordinates + self.speeds
+        named = {key if isinstance(key, str) else _name(key): x for key, x in values.items()}
+        unknown = [str(name) for name in named if name not in names]
+        if unknown:
+            raise ValueError(
+                f"`values` has {', '.join(unknown)}, which is neither a coordinate nor a speed. The coordinates are "
+                f"{', '.join(self.coordinates)}, the speeds {', '.join(self.speeds)}."
+            )
+        numbers = [jnp.asarray(named.get(name, 0.0), float) for name in names]
+        flat, n = jnp.stack(numbers), len(self.coordinates)
+        return flat[:n], flat[n:]
+
+
+@clear_errors
+@numbers_as_arrays("y", "args", times=("t",))
+@eqx.filter_jit
+def _consistent(
+    constraint: AbstractConstraint, metric: Y | None, t: RealScalarLike, y: Y, args: Args
+) -> Any:
+    projection = NewtonProjection(metric=metric, max_steps=50)
+    consistent, info = constraint.correct(projection, t, y, args, far=True)
+    diagnosis = Diagnosis.of_start(constraint, t, y, args, info)
+    return diagnosis.raise_unless(info.success, consistent, "y")
+
+
+def _name(key: Any) -> str:
+    try:
+        return name_of(key)
+    except AttributeError:
+        return str(key)
