@@ -27,7 +27,7 @@ LAYERS = [
     {"_adjoint"},
     {"_solve"},
     {"_mechanics"},
-    {"_applications", "_dae", "_ensemble.lanes", "_ensemble.stored"},
+    {"_applications", "_dae", "_ensemble.lanes", "_ensemble.stored", "_sympy"},
     {"_ensemble", "_ensemble.api"},
     {"_fit"},
     {"_manifolds", "_lie_groups"},
@@ -196,7 +196,7 @@ def test_importing_needs_no_extra():
     """Nor does anything that is not on the command line, draws nothing and writes no folder."""
     code = (
         "import sys, manifold_jax; "
-        "assert not {'typer', 'rich', 'matplotlib', 'zarr'} & set(sys.modules)"
+        "assert not {'typer', 'rich', 'matplotlib', 'sympy', 'zarr'} & set(sys.modules)"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
 

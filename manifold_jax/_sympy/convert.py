@@ -12,13 +12,13 @@ from .._base.user_functions import check_function
 from .._constraint.constraint import NoConstraint
 from .._mechanics import MechanicalSystem
 from .constraint import SymbolicConstraint
-from .equations import Equations, name_of, Symbols
+from .equations import Equations, Symbols
 from .field import SymbolicField
 from .function import SymbolicFunction
 from .system import Model, SymbolicSystem
 
 
-def from_sympy(method: Any, *, inputs: Mapping[Any, Callable] | None = None) -> SymbolicSystem:
+def from_sympy(method: Any, *, inputs: Mapping[Any, Any] | None = None) -> SymbolicSystem:
     r"""The vector field and the manifold of a model of `sympy.physics.mechanics`
     (`pip install "manifold_jax[sympy]"`).
 
@@ -61,8 +61,8 @@ def from_sympy(method: Any, *, inputs: Mapping[Any, Callable] | None = None) -> 
     require("sympy", "sympy", "`mj.from_sympy`")
     equations = Equations.of(method)
     symbols = Symbols.of(equations.parts(), equations.states)
-    named = _checked_inputs(inputs, symbols.inputs)
-    function = lambda *parts: SymbolicFunction.of(parts, equations.q, equations.u, named)
+    given = _checked_inputs(inputs, symbols.inputs)
+    function = lambda *parts: SymbolicFunction.of(parts, equations.q, equations.u, given)
     mechanics = _mechanical_system(equations, function)
     if mechanics is None:
         terms, constraint = (
@@ -71,8 +71,8 @@ def from_sympy(method: Any, *, inputs: Mapping[Any, Callable] | None = None) -> 
         )
     else:
         terms, constraint = mechanics.terms, mechanics.constraint
-    model = Model(equations.q, equations.u, symbols.parameters, equations.dependent)
-    return SymbolicSystem(terms, constraint, mechanics, named, model)
+    model = Model(equations.q, equations.u, symbols.parameters, tuple(given), equations.dependent)
+    return SymbolicSystem(terms, constraint, mechanics, tuple(given.values()), model)
 
 
 def _field(equations: Equations, function: Callable) -> SymbolicField:
@@ -119,16 +119,16 @@ def _mechanical_system(equations: Equations, function: Callable) -> MechanicalSy
     # Derivatives of inputs are given separately.
     if of_mass.has_time or of_mass.inputs or of_positions.inputs:
         return None
-    further = equations.velocities[h:, :]
+    further = equations.velocities[h:]
     return MechanicalSystem(
         _OfPositions(function(mass)),
         _OfPositions(function(positions)) if h else None,
-        _OfStates(function(equations.forcing[:n, :])),
+        _OfStates(function(equations.forcing[:n])),
         velocity_constraint=_OfStates(function(further)) if further else None,
     )
 
 
-def _checked_inputs(inputs: Mapping[Any, Callable] | None, needed: tuple[Any, ...]) -> dict:
+def _checked_inputs(inputs: Mapping[Any, Any] | None, needed: tuple[Any, ...]) -> dict:
     inputs = {} if inputs is None else dict(inputs)
     missing = [str(symbol) for symbol in needed if symbol not in inputs]
     if missing:
@@ -141,4 +141,4 @@ def _checked_inputs(inputs: Mapping[Any, Callable] | None, needed: tuple[Any, ..
         raise ValueError(f"`inputs` has {', '.join(unused)}, which the equations do not contain.")
     for symbol, f in inputs.items():
         check_function(f"inputs[{symbol}]", f, "x(t, y, args)")
-    return {name_of(symbol): f for symbol, f in inputs.items()}
+    return inputs

@@ -11,7 +11,7 @@ from .compat import (
 
 
 class Equations(NamedTuple):
-    """`K(q, t) q' = k`, `M(q, t) (u', multipliers) = f`, and the constraints, as SymPy's matrices.
+    """`K(q, t) q' = k`, `M(q, t) (u', multipliers) = f`, and the constraints, in SymPy's expressions.
 
     - `q`, `u`: the coordinates and speeds, functions of time. `u` are `q'` in Lagrange's method.
     - `kinematic`, `kinematic_forcing`, `mass`, `forcing`: `K`, `k`, `M`, `f`.
@@ -24,11 +24,11 @@ class Equations(NamedTuple):
     q: tuple[Any, ...]
     u: tuple[Any, ...]
     kinematic: Any
-    kinematic_forcing: Any
+    kinematic_forcing: tuple[Any, ...]
     mass: Any
-    forcing: Any
-    positions: Any
-    velocities: Any
+    forcing: tuple[Any, ...]
+    positions: tuple[Any, ...]
+    velocities: tuple[Any, ...]
     dependent: tuple[Any, ...]
     num_multipliers: int
 
@@ -49,11 +49,11 @@ class Equations(NamedTuple):
             q,
             u,
             kinematic=mass[:n, :n],
-            kinematic_forcing=forcing[:n, :],
+            kinematic_forcing=tuple(forcing[:n]),
             mass=mass[n:, n:],
-            forcing=forcing[n:, :],
-            positions=positions,
-            velocities=velocities,
+            forcing=tuple(forcing[n:]),
+            positions=tuple(positions),
+            velocities=tuple(velocities),
             dependent=dependent,
             num_multipliers=mass.shape[0] - n - len(u),
         )
@@ -63,9 +63,8 @@ class Equations(NamedTuple):
         return self.q + self.u
 
     def parts(self) -> tuple[Any, ...]:
-        """Return all matrices."""
-        matrices = self.kinematic, self.kinematic_forcing, self.mass, self.forcing
-        return (*matrices, self.positions, self.velocities)
+        of_motion = self.kinematic, self.kinematic_forcing, self.mass, self.forcing
+        return (*of_motion, self.positions, self.velocities)
 
 
 class Symbols(NamedTuple):
@@ -81,7 +80,7 @@ class Symbols(NamedTuple):
     def of(parts: tuple[Any, ...], states: tuple[Any, ...]) -> "Symbols":
         t = time_symbol()
         symbols, functions = _leaves([entry for part in parts for entry in entries_of(part)])
-        undefined = sorted(str(f) for f in functions if f.free_symbols != {t})
+        undefined = sorted(str(f) for f in functions if not _is_of_time(f, t))
         if undefined:
             raise ValueError(
                 f"The equations contain {', '.join(undefined)}, a function without a definition. Functions of time alone can "
@@ -96,14 +95,15 @@ class Symbols(NamedTuple):
                 f"The equations contain several symbols of the name {', '.join(repeated)}, which differ in their assumptions. "
                 "Values in `args` go by name: create each symbol once."
             )
-        return Symbols(t, parameters, tuple(sorted(inputs, key=str)), t in symbols)
+        return Symbols(t, parameters, tuple(sorted(inputs, key=name_of)), t in symbols)
 
 
 def entries_of(part: Any) -> list[Any]:
-    """Return the entries of a matrix row by row, or an expression alone."""
+    """Return the entries of a matrix row by row, those of a tuple, or an expression alone."""
     import sympy
 
-    return [*part] if getattr(part, "shape", ()) else [sympy.sympify(part)]
+    several = isinstance(part, tuple) or getattr(part, "shape", ())
+    return [*part] if several else [sympy.sympify(part)]
 
 
 def _leaves(entries: list[Any]) -> tuple[set[Any], set[Any]]:
@@ -127,6 +127,15 @@ def _leaves(entries: list[Any]) -> tuple[set[Any], set[Any]]:
         else:
             stack.extend(expression.args)
     return symbols, functions
+
+
+def _is_of_time(function: Any, t: Any) -> bool:
+    """Whether this is `x(t)` or a derivative of it, and not a function of coordinates."""
+    from sympy import Derivative
+
+    if isinstance(function, Derivative):
+        return set(function.variables) == {t} and _is_of_time(function.expr, t)
+    return function.args == (t,)
 
 
 def name_of(symbol: Any) -> str:

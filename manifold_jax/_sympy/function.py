@@ -14,26 +14,27 @@ from .equations import entries_of, name_of, Symbols
 
 
 class SymbolicFunction(eqx.Module):
-    """Matrices of expressions as a function `f(t, (q, u), args)`, which returns a tuple of arrays.
+    """Expressions, tuples and matrices of them as a function `f(t, (q, u), args)`, which returns a tuple of
+    arrays.
 
-    Subexpressions that occur more than once are evaluated once. `inputs` are the functions of time that
-    occur, by their names.
+    Subexpressions that occur more than once are evaluated once. `inputs` are those that occur.
     """
 
     evaluate: Callable = eqx.field(static=True)  # of time, states, parameters and inputs: numbers
     sizes: tuple[int, int] = eqx.field(static=True)  # of q and u
     parameters: tuple[str, ...] = eqx.field(static=True)
     result_shapes: tuple[tuple[int, ...], ...] = eqx.field(static=True)
-    inputs: dict[str, Callable]
+    input_names: tuple[str, ...] = eqx.field(static=True)
+    inputs: tuple[Callable, ...]
 
     @staticmethod
     def of(
         parts: tuple[Any, ...],
         q: tuple[Any, ...],
         u: tuple[Any, ...],
-        inputs: Mapping[str, Callable],
+        inputs: Mapping[Any, Callable],
     ) -> "SymbolicFunction":
-        """Build the function; `inputs` by name may contain more than those that occur."""
+        """Build the function; `inputs` may contain more than those that occur."""
         symbols = Symbols.of(parts, q + u)
         evaluate = _lambdified(parts, symbols, q + u)
         return SymbolicFunction(
@@ -41,7 +42,8 @@ class SymbolicFunction(eqx.Module):
             (len(q), len(u)),
             tuple(map(str, symbols.parameters)),
             tuple(_shape(part) for part in parts),
-            {name: inputs[name] for name in map(name_of, symbols.inputs)},
+            tuple(map(name_of, symbols.inputs)),
+            tuple(inputs[symbol] for symbol in symbols.inputs),
         )
 
     def __call__(self, t: RealScalarLike, y: Y, args: Args = None) -> tuple[jax.Array, ...]:
@@ -51,7 +53,7 @@ class SymbolicFunction(eqx.Module):
         parameters = [number(x) for x in values_of(self.parameters, args)]
         inputs = [
             number(_scalar(f"`inputs` of {name}", function(t, y, args)))
-            for name, function in sorted(self.inputs.items())
+            for name, function in zip(self.input_names, self.inputs, strict=True)
         ]
         flat = self.evaluate(number(t), [*q, *u], parameters, inputs)
         numbers, results = iter(flat), []
@@ -96,11 +98,7 @@ def _scalar(what: str, value: Any) -> Any:
 
 
 def _shape(part: Any) -> tuple[int, ...]:
-    """Return the shape of the array: `(n,)` of a column, `(0,)` of a matrix without entries."""
-    shape = tuple(getattr(part, "shape", ()))
-    if 0 in shape:
-        return (0,)
-    return shape[:1] if shape[1:] == (1,) else shape
+    return (len(part),) if isinstance(part, tuple) else tuple(getattr(part, "shape", ()))
 
 
 def _lambdified(parts: tuple[Any, ...], symbols: Symbols, states: tuple[Any, ...]) -> Callable:

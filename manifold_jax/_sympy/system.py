@@ -21,12 +21,12 @@ from .function import SymbolicFunction
 
 
 class Model(NamedTuple):
-    """The symbols of the coordinates, the speeds and the parameters, and those of the first two that Kane's
-    method calls dependent."""
+    """The symbols of a model; `dependent` are the coordinates and speeds that Kane's method calls so."""
 
     q: tuple[Any, ...]
     u: tuple[Any, ...]
     parameters: tuple[Any, ...]
+    inputs: tuple[Any, ...]
     dependent: tuple[Any, ...]
 
 
@@ -42,7 +42,7 @@ class SymbolicSystem(eqx.Module):
     terms: dfx.AbstractTerm
     constraint: AbstractConstraint
     mechanics: MechanicalSystem | None
-    inputs: dict[str, Callable]
+    inputs: tuple[Callable, ...]
     model: Model = eqx.field(static=True)
 
     @property
@@ -117,7 +117,10 @@ class SymbolicSystem(eqx.Module):
         - `expression`: an expression, or a matrix, of coordinates, speeds, parameters and inputs. A column
             becomes an array of shape `(n,)`.
         """
-        inner = SymbolicFunction.of((expression,), self.model.q, self.model.u, self.inputs)
+        is_column = getattr(expression, "shape", ())[1:] == (1,)
+        part = tuple(expression) if is_column else expression
+        inputs = dict(zip(self.model.inputs, self.inputs, strict=True))
+        inner = SymbolicFunction.of((part,), self.model.q, self.model.u, inputs)
         return lambda t, y, args: inner(t, y, args)[0]
 
     def _only_dependent(self) -> tuple[np.ndarray, np.ndarray] | None:
