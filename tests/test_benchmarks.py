@@ -14,7 +14,7 @@ import pytest
 ROOT = Path(__file__).parents[1]
 sys.path.append(str(ROOT))
 
-FOLDERS = ("dae_board", "peers", "sbml_events", "speed", "tools")
+FOLDERS = ("dae_board", "peers", "sbml_events", "speed", "sympy_models", "tools")
 MODULES = sorted(
     ".".join(path.relative_to(ROOT).with_suffix("").parts)
     for folder in FOLDERS
@@ -59,6 +59,7 @@ TOO_LONG = {
     "benchmarks.speed.overhead",
     "benchmarks.speed.scaling",
     "benchmarks.speed.thresholds",
+    "benchmarks.sympy_models.__main__",  # its parts are in test_sympy.py
 }
 QUICK = ("benchmarks.speed.accelerator",)
 

@@ -212,6 +212,8 @@ def test_expressions_are_functions(disc):
     assert_close(vector(0.0, y, gallery.args), [0.5, np.cos(2.0)])
     assert model.function(spin**2)(0.0, y, gallery.args).shape == ()
     assert model.function(sm.eye(2))(0.0, y, gallery.args).shape == (2, 2)
+    with refused(ValueError, "`expression` contains Derivative(heading(t), t), which is neither"):
+        model.function(heading.diff())
 
 
 def test_single_precision_stays_single(disc):

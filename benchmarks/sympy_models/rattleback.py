@@ -73,7 +73,7 @@ def published_equations(t: float, state: np.ndarray) -> np.ndarray:
     return np.array([alpha_rate, beta_rate, gamma_rate, *np.linalg.solve(of_contact, torque)])
 
 
-def published_motion(times: np.ndarray, tolerance: float = 1e-12) -> np.ndarray:
+def published_motion(times: np.ndarray, tolerance: float = 1e-10) -> np.ndarray:
     """Return alpha, beta, gamma and the angular velocities at these times, a row each, by SciPy."""
     start = np.array([START["alpha"], START["beta"], 0.0, 0.0, 0.0, START["w3"]])
     span, options = (times[0], times[-1]), {"rtol": tolerance, "atol": tolerance}

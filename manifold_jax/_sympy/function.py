@@ -115,7 +115,8 @@ def _lambdified(parts: tuple[Any, ...], symbols: Symbols, states: tuple[Any, ...
     entries = [_replaced(x, known) for part in parts for x in entries_of(part)]
     shared, entries = sympy.cse(entries, order="none", list=False)
     time, *rest = [[renamed[symbol] for symbol in group] for group in groups]
-    return sympy.lambdify([*time, *rest], entries, modules="jax", cse=lambda _: (shared, entries))
+    done = lambda _: (shared, entries)
+    return sympy.lambdify([*time, *rest], entries, modules="jax", cse=done)  # pyright: ignore[reportArgumentType]
 
 
 def _replaced(expression: Any, known: dict[Any, Any]) -> Any:

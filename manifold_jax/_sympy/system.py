@@ -16,7 +16,7 @@ from .._constraint.constraint import AbstractConstraint, NoConstraint
 from .._constraint.diagnosis import Diagnosis
 from .._constraint.settings import NewtonProjection
 from .._mechanics import MechanicalSystem
-from .equations import name_of
+from .equations import name_of, Symbols
 from .function import SymbolicFunction
 
 
@@ -116,10 +116,21 @@ class SymbolicSystem(eqx.Module):
 
         - `expression`: an expression, or a matrix, of coordinates, speeds, parameters and inputs. A column
             becomes an array of shape `(n,)`.
+
+        **Raises:**
+
+        `ValueError` for other functions of time, such as derivatives of the coordinates in Kane's method: replace
+        those by `method.kindiffdict()`.
         """
         is_column = getattr(expression, "shape", ())[1:] == (1,)
         part = tuple(expression) if is_column else expression
         inputs = dict(zip(self.model.inputs, self.inputs, strict=True))
+        found = Symbols.of((part,), self.model.q + self.model.u).inputs
+        if unknown := [str(symbol) for symbol in found if symbol not in inputs]:
+            raise ValueError(
+                f"`expression` contains {', '.join(unknown)}, which is neither a coordinate, a speed nor an input. Replace "
+                "derivatives of coordinates by `method.kindiffdict()` of a `KanesMethod`."
+            )
         inner = SymbolicFunction.of((part,), self.model.q, self.model.u, inputs)
         return lambda t, y, args: inner(t, y, args)[0]
 
