@@ -7,8 +7,8 @@ forward, y to the right, z down, the origin at the rear contact; measures of Tab
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
-import scipy.linalg
 import sympy as sm
 import sympy.physics.mechanics as me
 
@@ -135,31 +135,31 @@ def kanes_method() -> tuple[me.KanesMethod, sm.Expr]:
     return method, energy
 
 
-def straight_ahead(model: Any, args: dict[str, Any], speed: float, **others: float) -> Any:
+def straight_ahead(model: Any, args: dict[str, Any], speed: Any, **others: float) -> Any:
     """Return the state at a forward speed (m/s), upright unless `others` say something else."""
     wheels = {"u_R": -speed / args["r_R"], "u_F": -speed / args["r_F"]}
     return model.state({**wheels, **others}, args)
 
 
-def eigenvalues(model: Any, args: dict[str, Any], speed: float) -> np.ndarray:
-    """Return the eigenvalues of lean and steer, of the equations linearized along the manifold.
+def eigenvalues(model: Any, args: dict[str, Any], speeds: Any) -> np.ndarray:
+    """Return the four eigenvalues of lean and steer at each speed, of the equations linearized along the manifold.
 
     The lateral motion and the motion ahead are independent of each other to first order.
     """
-    q, u = straight_ahead(model, args, speed)
-    y, names = np.concatenate([q, u]), model.coordinates + model.speeds
-    split = lambda y: (y[: len(q)], y[len(q) :])
-    flat = lambda parts: jax.numpy.concatenate(parts)
-    A, G = (
-        np.asarray(jax.jacfwd(lambda y, f=f: flat(f(0.0, split(y), args)))(y))
-        for f in (model.terms.vector_field, model.constraint)
-    )
-    free = [names.index(name) for name in ("lean", "steer", "u_lean", "u_steer")]
-    dependent = [names.index(name) for name in ("pitch", "u_yaw", "u_pitch", "u_F")]
-    tangent = np.zeros((len(y), 4))
-    tangent[free] = np.eye(4)
-    tangent[dependent] = -scipy.linalg.solve(G[:, dependent], G[:, free])
-    return np.linalg.eigvals(A[free] @ tangent)
+    names, n = model.coordinates + model.speeds, len(model.coordinates)
+    free = np.array([names.index(name) for name in ("lean", "steer", "u_lean", "u_steer")])
+    others = np.array([names.index(name) for name in ("pitch", "u_yaw", "u_pitch", "u_F")])
+
+    def linearized(speed: Any) -> Any:
+        y = jnp.concatenate(straight_ahead(model, args, speed))
+        of_vector = lambda f: lambda y: jnp.concatenate(f(0.0, (y[:n], y[n:]), args))
+        A, G = (jax.jacfwd(of_vector(f))(y) for f in (model.terms.vf, model.constraint))
+        tangent = jnp.zeros((len(names), 4)).at[free].set(jnp.eye(4))
+        along = -jnp.linalg.solve(G[:, others], G[:, free])
+        return A[free] @ tangent.at[others].set(along)
+
+    matrices = jax.jit(jax.vmap(linearized))(jnp.asarray(speeds, float))
+    return np.linalg.eigvals(np.asarray(matrices))
 
 
 def published(speed: int) -> np.ndarray:

@@ -8,7 +8,7 @@ import numpy as np
 from . import bicycle
 
 
-def draw(path: Path, rattle: Any, bike: Any) -> None:
+def draw(path: Path, rattle: Any, bike: Any, speeds: np.ndarray, eigenvalues: np.ndarray) -> None:
     import matplotlib
 
     matplotlib.use("agg")
@@ -17,7 +17,7 @@ def draw(path: Path, rattle: Any, bike: Any) -> None:
     figure, axes = plt.subplots(1, 3, figsize=(12, 3.6), layout="constrained")
     _rattleback(axes[0], rattle)
     _bicycle(axes[1], bike)
-    _eigenvalues(axes[2], bike)
+    _eigenvalues(axes[2], speeds, eigenvalues)
     figure.savefig(path, dpi=150)
     plt.close(figure)
 
@@ -42,8 +42,10 @@ def _bicycle(axes: Any, motion: Any) -> None:
 
 def _eigenvalues(axes: Any, motion: Any) -> None:
     speeds = np.linspace(0.0, 10.0, 101)
-    found = [np.sort(bicycle.eigenvalues(motion.model, motion.args, v).real) for v in speeds]
-    axes.plot(speeds, found, color="C0", lw=1, label=["computed", *[None] * 3])
+    found = bicycle.eigenvalues(motion.model, motion.args, speeds)
+    axes.plot(
+        speeds, np.sort(found.real, axis=1), color="C0", lw=1, label=["computed", *[None] * 3]
+    )
     for speed in range(11):
         published = bicycle.published(speed).real
         label = "published" if speed == 0 else None

@@ -103,10 +103,8 @@ class SymbolicSystem(eqx.Module):
 
         `ValueError` for names that are neither; a `RuntimeError` if no state is found near the guess.
         """
-        y = self._named_state(values)
-        if isinstance(self.constraint, NoConstraint):
-            return y
-        return _consistent(self.constraint, self._only_dependent(), t, y, args)
+        numbers = self._in_order(values)
+        return _consistent(self.constraint, self._only_dependent(), t, numbers, args)
 
     def function(self, expression: Any) -> Callable[[RealScalarLike, Y, Args], jax.Array]:
         """Return a further expression of the model, such as its energy or the position of a point, as a
@@ -143,7 +141,8 @@ class SymbolicSystem(eqx.Module):
         )
         return weight(self.model.q), weight(self.model.u)
 
-    def _named_state(self, values: Mapping[Any, Any]) -> tuple[jax.Array, jax.Array]:
+    def _in_order(self, values: Mapping[Any, Any]) -> tuple[list[Any], list[Any]]:
+        """Return the numbers of the state in the order of its symbols."""
         names = self.coordinates + self.speeds
         named = {key if isinstance(key, str) else _name(key): x for key, x in values.items()}
         unknown = [str(name) for name in named if name not in names]
@@ -152,17 +151,23 @@ class SymbolicSystem(eqx.Module):
                 f"`values` has {', '.join(unknown)}, which is neither a coordinate nor a speed. The coordinates are "
                 f"{', '.join(self.coordinates)}, the speeds {', '.join(self.speeds)}."
             )
-        numbers = [jnp.asarray(named.get(name, 0.0), float) for name in names]
-        flat, n = jnp.stack(numbers), len(self.coordinates)
-        return flat[:n], flat[n:]
+        given = lambda names: [named.get(name, 0.0) for name in names]
+        return given(self.coordinates), given(self.speeds)
 
 
 @clear_errors
-@numbers_as_arrays("y", "args", times=("t",))
+@numbers_as_arrays("numbers", "args", times=("t",))
 @eqx.filter_jit
 def _consistent(
-    constraint: AbstractConstraint, metric: Y | None, t: RealScalarLike, y: Y, args: Args
+    constraint: AbstractConstraint,
+    metric: Y | None,
+    t: RealScalarLike,
+    numbers: tuple[list[Any], list[Any]],
+    args: Args,
 ) -> Any:
+    q, u = y = tuple(jnp.stack([jnp.asarray(x, float) for x in part]) for part in numbers)
+    if isinstance(constraint, NoConstraint):
+        return q, u
     projection = NewtonProjection(metric=metric, max_steps=50)
     consistent, info = constraint.correct(projection, t, y, args, far=True)
     diagnosis = Diagnosis.of_start(constraint, t, y, args, info)
