@@ -40,12 +40,9 @@ def _bicycle(axes: Any, motion: Any) -> None:
     axes.legend()
 
 
-def _eigenvalues(axes: Any, motion: Any) -> None:
-    speeds = np.linspace(0.0, 10.0, 101)
-    found = bicycle.eigenvalues(motion.model, motion.args, speeds)
-    axes.plot(
-        speeds, np.sort(found.real, axis=1), color="C0", lw=1, label=["computed", *[None] * 3]
-    )
+def _eigenvalues(axes: Any, speeds: np.ndarray, found: np.ndarray) -> None:
+    parts = np.sort(found.real, axis=1)
+    axes.plot(speeds, parts, color="C0", lw=1, label=["computed", *[None] * 3])
     for speed in range(11):
         published = bicycle.published(speed).real
         label = "published" if speed == 0 else None

@@ -116,7 +116,8 @@ def _lambdified(parts: tuple[Any, ...], symbols: Symbols, states: tuple[Any, ...
     shared, entries = sympy.cse(entries, order="none", list=False)
     time, *rest = [[renamed[symbol] for symbol in group] for group in groups]
     done = lambda _: (shared, entries)
-    return sympy.lambdify([*time, *rest], entries, modules="jax", cse=done)  # pyright: ignore[reportArgumentType]
+    function = sympy.lambdify([*time, *rest], entries, modules="jax", cse=done)  # pyright: ignore[reportArgumentType]
+    return jax.jit(function)  # traced once: a solve calls it forty times
 
 
 def _replaced(expression: Any, known: dict[Any, Any]) -> Any:
