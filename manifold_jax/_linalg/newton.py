@@ -20,7 +20,7 @@ from .pivoted import factorize_equilibrated
 
 
 @runtime_checkable
-class LinearizedEquations(Protocol):
+class LinearizedAtPoint(Protocol):
     """The matrix `dr/dz`, factored."""
 
     def solve(self, b: Float[Array, " m"]) -> Float[Array, " m"]: ...
@@ -38,7 +38,7 @@ class AbstractEquations(eqx.Module):
         """Return the residual at a point."""
 
     @abc.abstractmethod
-    def linearize(self, x: Float[Array, " n"]) -> LinearizedEquations:
+    def linearize(self, x: Float[Array, " n"]) -> LinearizedAtPoint:
         """Return the derivative of the residual with respect to the unknowns, at a point."""
 
 
@@ -105,7 +105,7 @@ _WRITTEN_OUT = 2
 
 def chord(
     equations: AbstractEquations,
-    linearization: LinearizedEquations,
+    linearization: LinearizedAtPoint,
     z: Float[Array, " m"],
     r: Float[Array, " m"],
     scale: Float[Array, " m"],
@@ -179,7 +179,7 @@ class ImplicitTangent(NamedTuple):
 
     dz: Float[Array, " m"]
     moved: Float[Array, " n"]
-    linearization: LinearizedEquations
+    linearization: LinearizedAtPoint
 
 
 def implicit_tangent(

@@ -23,7 +23,7 @@ from .._linalg.dense import pseudo_invert
 from .bodies import check_orientation, Pose
 from .checks import check_shape, is_concrete, on_host, stack
 from .rotations import quaternion_rate
-from .system import ConstantAssembly, Equations
+from .system import ConstantAssembly, JointEquations
 
 
 # Joints count as closed below this gap (m, or the sine of an angle), or this many units of rounding.
@@ -100,7 +100,7 @@ class LoopClosure:
         self.assembly, self.at = assembly, (t, args)
         (self.x, self.unravel), (self.w, _) = map(jfu.ravel_pytree, y)
         self.free_x, self.free_w = (np.flatnonzero(~part) for part in kept)
-        joints = Equations(ConstantAssembly(assembly))
+        joints = JointEquations(ConstantAssembly(assembly))
         phi = lambda t, x: jfu.ravel_pytree(joints(t, self.unravel(x), args))[0]
         self.phi = lambda x: phi(t, x)
         self.jacobian = lambda x: jax.jacfwd(phi, 1)(t, x)
@@ -113,7 +113,7 @@ class LoopClosure:
     def named_rows(self) -> list[tuple[str, np.ndarray]]:
         """The rows of every joint among the equations."""
         (t, args), bodies = self.at, self.assembly.bodies
-        of_joints = lambda: Equations(ConstantAssembly(self.assembly))(t, bodies.drawing, args)
+        of_joints = lambda: JointEquations(ConstantAssembly(self.assembly))(t, bodies.drawing, args)
         named, start = [], 0
         for group, part in zip(self.assembly.joints, jax.eval_shape(of_joints), strict=False):
             rows = start + np.arange(part.size).reshape(part.shape)

@@ -31,7 +31,7 @@ class _Mass(eqx.Module):
         return self.source(args).bodies.mass_matrix(q)
 
 
-class Equations(AbstractPositions):
+class JointEquations(AbstractPositions):
     """The equations of joints, and the norms of quaternions: all, or those of the given numbers."""
 
     source: Callable
@@ -79,5 +79,5 @@ class _Forces(eqx.Module):
 def system_of(
     source: Callable, redundant: bool, rows: tuple[int, ...] | None = None
 ) -> MechanicalSystem:
-    equations = Equations(source, rows)
+    equations = JointEquations(source, rows)
     return MechanicalSystem(_Mass(source), equations, _Forces(source), redundant=redundant)
