@@ -200,6 +200,19 @@ CHANGES = {  # of the file and the arguments, and what is said
         {"configuration": {"elbow": 1.0}},
         "'elbow', which is no hinge or slider",
     ),
+    "locked": (
+        (),
+        {
+            "closures": cases.CLOSURES | {"closed_loop": [["second", "left lower"]]},
+            "configuration": {},
+        },
+        "'about z' cannot move",
+    ),
+    "base": (
+        (cases.link("base", 1.0, 0.1), cases.link("base")),
+        {"floating_base": True},
+        "the root link 'base' has no mass",
+    ),
     "ignored": ((), {"ignore": ("mass",)}, r"`ignore` has \['mass'\]"),
 }
 

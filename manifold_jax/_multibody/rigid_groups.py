@@ -167,6 +167,10 @@ def joint_between(connection: Connection, names: Mapping[str, str]) -> AbstractJ
 def body_names(groups: Groups, root: str, moves: bool) -> dict[str, str]:
     """Return the name of the body of every group that has one; that of the root may be the ground."""
     root = groups.of(root)
+    if moves and groups.mass(root) == 0:
+        raise ValueError(
+            f"`floating_base=True`, but the root link {root!r} has no mass. Give it mass and inertia in `file`."
+        )
     names = {
         group: groups.body_name(group)
         for group in groups.members
