@@ -33,6 +33,8 @@ from ._fit import FitResult as FitResult
 from ._fit.fit import fit as fit
 from ._mechanics import (
     Baumgarte as Baumgarte,
+    Equilibrium as Equilibrium,
+    equilibrium as equilibrium,
     impact as impact,
     MechanicalSystem as MechanicalSystem,
     rattle as rattle,
