@@ -63,5 +63,7 @@ def test_what_has_no_equilibrium_or_no_unique_multipliers():
         mj.equilibrium(point(redundant=True), jnp.zeros(2))
     with pytest.raises(ValueError, match="neither velocity constraints"):
         mj.equilibrium(point(velocity_constraint=lambda t, q, v, args: v[1]), jnp.zeros(2))
-    with pytest.raises(TypeError, match="MechanicalSystem"):  # of this library, or of the type checker
+    with pytest.raises(
+        TypeError, match="MechanicalSystem"
+    ):  # of this library, or of the type checker
         mj.equilibrium(lambda q: q, jnp.zeros(2))
