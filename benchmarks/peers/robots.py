@@ -82,12 +82,10 @@ def main(
             continue
         rows.append(measure(folder, name, seconds))
         console.print(rows[-1])
+        if json is not None:  # after each, as some take minutes
+            content = dict(environment("pin"), seconds=seconds)
+            write_json(json, content | dict(rows=[dataclasses.asdict(row) for row in rows]))
     console.print(table(rows))
-    if json is not None:
-        content = dict(
-            environment("pin"), seconds=seconds, rows=[dataclasses.asdict(r) for r in rows]
-        )
-        write_json(json, content)
 
 
 def measure(folder: Path, name: str, seconds: float) -> Row:
