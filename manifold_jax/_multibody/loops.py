@@ -110,6 +110,7 @@ def _check_closed(tree: KinematicTree, closures: Sequence[Closure], x: np.ndarra
     if open_ := sorted((pair for pair in sizes if not pair[0] <= _CLOSED), reverse=True):
         worst = ", ".join(f"{name} (gap {size:.3g})" for size, name in open_[:5])
         raise ValueError(
-            f"The loops cannot be closed: {worst}, in m or rad. Check `closures`, lengths, and the joint coordinates in "
-            "`configuration`, from which they are closed."
+            f"The loops cannot be closed: {worst}, in m or of the axes. Check `closures`, lengths, and the joint coordinates in "
+            "`configuration`, from which they are closed. Hinges that are not quite parallel cannot reach a weld, '6d', but close "
+            "as ball joints, '3d'."
         )
