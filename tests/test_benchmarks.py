@@ -26,7 +26,7 @@ PROGRAMS = {
     if "\ndef main(" in (ROOT / f"{module.replace('.', '/')}.py").read_text()
 }
 # Of others, and not needed for anything else.
-PEERS = ("casadi", "mujoco", "pydiffsol", "sksundae")
+PEERS = ("casadi", "mujoco", "pinocchio", "pydiffsol", "sksundae", "yaml")
 SMALLEST = {
     "benchmarks.dae_board.__main__": dict(problems="linear: generator", quick=True, repeats=1),
     "benchmarks.peers.approaches": dict(problems="pendulum", repeats=1, quick=True),
@@ -52,6 +52,7 @@ SMALLEST = {
 TOO_LONG = {
     "benchmarks.peers.mechanisms_mujoco",
     "benchmarks.peers.neural",
+    "benchmarks.peers.robots",
     "benchmarks.peers.stiff",
     "benchmarks.speed.adaptive_gradients",
     "benchmarks.speed.bandwidths",
