@@ -90,3 +90,24 @@ def tip(side, angles):
     (l1, l2), x = LENGTHS[side], 0.0 if side == "left" else BASE
     a, b = angles
     return np.array([x + l1 * np.sin(a) + l2 * np.sin(b), l1 * np.cos(a) + l2 * np.cos(b)])
+
+
+# A chain of bodies with joints of all kinds, turned against each other.
+CHAIN_TYPES = {"joint_name": ["ball", "cardan"], "joint_type": ["SPHERICAL", "UJOINT_ZX"]}
+
+
+def chain():
+    turned = lambda text: text.replace("<origin xyz", '<origin rpy="0.3 -0.7 1.1" xyz')
+    parts = [link("base")]
+    parts += [link(name, 1.0, 0.1, 0.2) for name in ("one", "two", "three", "four", "five")]
+    parts += [link("between"), link("inside")]
+    parts += [
+        turned(joint("slide", "prismatic", "base", "one", (0.1, 0.2, 0.3), (1, 2, 0))),
+        turned(joint("across first", "revolute", "one", "between", (0.3, 0, 0.1), (0, 0, 1))),
+        joint("across second", "revolute", "between", "two", axis=(1, 1, 0)),
+        turned(joint("turn", "continuous", "two", "inside", (0, 0.4, 0), (0, 1, 0))),
+        joint("push", "prismatic", "inside", "three", axis=(0, 1, 0)),
+        turned(joint("ball", "revolute", "three", "four", (0, 0, 0.5))),
+        turned(joint("cardan", "revolute", "four", "five", (0.2, 0, 0.2))),
+    ]
+    return "<robot name='chain'>" + "".join(parts) + "</robot>"

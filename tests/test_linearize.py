@@ -110,6 +110,9 @@ def test_equations_that_depend_on_each_other():
     y = jnp.array([0.6, 0.8])
     with pytest.raises(ValueError, match="1 of the 2 equations depend on others in `y`"):
         mj.linearize(turning, mj.Constraint(twice), 0.0, y)
+    assert np.isnan(
+        eqx.filter_jit(mj.linearize)(turning, mj.Constraint(twice), 0.0, y).matrix
+    ).all()
     known = mj.Constraint(twice, redundant=True)
     # Neighbours on the circle stay as far away as they are.
     np.testing.assert_allclose(mj.linearize(turning, known, 0.0, y).matrix, [[0.0]], atol=1e-15)

@@ -7,8 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import robot_cases as cases
+from scipy.spatial.transform import Rotation
 
 import manifold_jax as mj
+from manifold_jax._multibody.closures import motions_of
+from manifold_jax._multibody.kinematic_tree import KinematicTree
+from manifold_jax._multibody.urdf_elements import read_elements
 
 
 mb = mj.multibody
@@ -122,6 +126,36 @@ def test_gradients_by_numbers_of_the_file(robot):
         gradient = float(leaf(by_file)[place])
         assert abs(gradient) > 1e-5
         assert gradient == pytest.approx(difference, rel=1e-7)
+
+
+def test_joints_of_chains_allow_what_the_file_allows():
+    """Wherever the coordinates of the tree are, the bodies satisfy the equations of the joints that were made
+    of it: hinges and sliders one after the other, and joints whose type is changed."""
+    chain = cases.chain()
+    robot = mb.read_urdf(chain, closures=cases.CHAIN_TYPES, gravity=(0.0, 0.0, 0.0))
+    kinds = {name: group.kind for group in robot.assembly.joints for name in group.attachment.names}
+    assert kinds == {
+        "slide": mb.Prismatic,
+        "across first across second": mb.Universal,
+        "turn push": mb.Cylindrical,
+        "ball": mb.Spherical,
+        "cardan": mb.Universal,
+    }
+    links, joints = read_elements(chain)
+    types = dict(zip(cases.CHAIN_TYPES["joint_name"], cases.CHAIN_TYPES["joint_type"], strict=True))
+    tree = KinematicTree(links, joints, {joint.name: motions_of(joint, types) for joint in joints})
+    drawn, _ = tree.place(np.zeros(tree.size))
+    moved, _ = tree.place(np.random.default_rng(3).normal(size=tree.size))
+    names, positions, orientations = robot.assembly.names, {}, {}
+    for name, center in zip(names, np.asarray(robot.assembly.bodies.drawing.position), strict=True):
+        turn = moved[name].rotation @ drawn[name].rotation.T
+        positions[name] = moved[name].origin + turn @ (center - drawn[name].origin)
+        orientations[name] = Rotation.from_matrix(turn).as_quat(scalar_first=True)
+    y = robot.assembly.state(positions, orientations)  # refuses gaps above 1e-6
+    gaps = robot.assembly.gaps(y[0])
+    assert max(float(jnp.max(jnp.abs(gap))) for gap in gaps.values()) < 1e-14
+    # And no more than that: as many motions as coordinates.
+    assert 7 * len(names) - sum(gap.size for gap in gaps.values()) - len(names) == tree.size
 
 
 def test_a_free_base_falls():

@@ -87,7 +87,8 @@ def linearize(
     **Returns:** a [`Linearization`][]. Its derivatives by `y` and `args` are those of a basis that moves with
     the manifold, hence exact for eigenvalues and other numbers that do not depend on the basis.
 
-    **Raises** `ValueError` if the equations of `constraint` depend on each other in `y`, unless `redundant`.
+    **Raises** `ValueError` if the equations of `constraint` depend on each other in `y`, unless `redundant`; inside
+    `jit` the result is NaN then.
 
     Source: Haug, Computer Aided Kinematics and Dynamics of Mechanical Systems (1989); Negrut & Ortiz,
     J. Comput. Nonlinear Dyn. 1 (2006) 230-239 (linearization of constrained mechanisms).
@@ -133,18 +134,19 @@ def _derivatives(
 def _basis(G: Float[Array, "m n"], redundant: bool) -> Float[Array, "n d"]:
     """Return an orthonormal basis of the null space."""
     _, sizes, right = jnp.linalg.svd(G, full_matrices=True)
-    known = not isinstance(sizes, jax.core.Tracer)
-    rank = min(G.shape)
-    if known:
-        rank = int(np.sum(np.asarray(sizes) > _DEPENDENT * np.max(sizes, initial=0)))
+    independent = sizes > _DEPENDENT * jnp.max(sizes, initial=0)
+    rank, m = min(G.shape), G.shape[0]
+    if not isinstance(sizes, jax.core.Tracer):
+        rank = int(np.sum(np.asarray(independent)))
     elif redundant:
         raise ValueError(
             "`constraint` has `redundant=True`: the number of tangent directions depends on the numbers. Call `linearize` "
             "outside of `jit`, `vmap` and derivatives, or remove the dependent equations."
         )
-    if rank < G.shape[0] and not redundant:
+    if rank < m and not redundant:
         raise ValueError(
-            f"`constraint`: {G.shape[0] - rank} of the {G.shape[0]} equations depend on others in `y`. Remove them, start "
-            "beside a singular point, or write `redundant=True`."
+            f"`constraint`: {m - rank} of the {m} equations depend on others in `y`. Remove them, start beside a singular "
+            "point, or write `redundant=True`."
         )
-    return right[rank:].T
+    unknown = jnp.where(redundant | jnp.all(independent), 0, jnp.nan).astype(G.dtype)
+    return right[rank:].T + unknown

@@ -10,7 +10,6 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._base.numbers import numbers_as_arrays
 from .._base.types import Args, RealScalarLike
 from .._mechanics import MechanicalSystem
 from .bodies import Bodies, Body, Pose
@@ -19,7 +18,8 @@ from .equations import DRIVEN
 from .forces import AbstractForce
 from .frames import Frames, in_space, Placed, with_ground
 from .independent import find_independent, Independent
-from .joint_groups import group_restraints, JointGroup, reactions, residuals
+from .joint_forces import find_joint_forces
+from .joint_groups import group_restraints, JointGroup, residuals
 from .joints import AbstractRestraint, Revolute
 from .loads import AbstractLoads, group_forces
 from .picture import draw_outline, new_axes, outline_of, write_film
@@ -214,9 +214,9 @@ class Assembly(eqx.Module):
         `t` or the times of all states. With `redundant` joints only the sum over those that depend on
         each other is determined."""
         if y[0].position.ndim == 2:
-            return _joint_forces(self, t, y, args)
+            return find_joint_forces(self, t, y, args)
         times = jnp.broadcast_to(floating(t), y[0].position.shape[:1])
-        return jax.vmap(lambda t, y: _joint_forces(self, t, y, args))(times, y)
+        return jax.vmap(lambda t, y: find_joint_forces(self, t, y, args))(times, y)
 
     @over_times
     def energy(self, y: tuple[Pose, Pose]) -> Energy:
@@ -284,38 +284,3 @@ class Assembly(eqx.Module):
     def joints_at(self, t: RealScalarLike, args: Args) -> tuple[JointGroup, ...]:
         """Return the joints with the motions of drives at that time."""
         return tuple(group.at(t, args) for group in self.joints)
-
-
-@numbers_as_arrays("args", times=("t",))
-@eqx.filter_jit
-def _joint_forces(
-    assembly: Assembly, t: RealScalarLike, y: tuple[Pose, Pose], args: Args
-) -> dict[str, JointForce]:
-    """Compiled also when called alone: operation by operation it takes many times as long."""
-    multipliers, frames = _all_multipliers(assembly, t, y, args), Frames.of(*y)
-    found, start = {}, 0
-    for group in assembly.joints_at(t, args):
-        k, r = group.residual(group.attachment.sides(frames)).shape
-        own = multipliers[start : start + k * r].reshape(k, r)
-        start += k * r
-        forces, torques = reactions(group, frames, own)
-        if assembly.bodies.planar:
-            forces, torques = forces[:, :2], torques[:, 2]
-        on_second = map(JointForce, forces, torques)
-        found |= dict(zip(group.attachment.names, on_second, strict=True))
-    return found
-
-
-def _all_multipliers(
-    assembly: Assembly, t: RealScalarLike, y: tuple[Pose, Pose], args: Args
-) -> Float[Array, " m"]:
-    """Return the multipliers of all joints; zero for equations that are not solved."""
-    multipliers = assembly.system.multipliers(t, y, args)
-    if assembly.independent is None:
-        return multipliers
-    size = sum(part.size for part in residuals(assembly.joints_at(t, args), y[0])) + len(
-        assembly.names
-    )
-    return (
-        jnp.zeros(size, multipliers.dtype).at[np.array(assembly.independent.rows)].set(multipliers)
-    )

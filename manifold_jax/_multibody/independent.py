@@ -1,5 +1,6 @@
 """The equations of joints that do not depend on others: closed loops have more than are needed."""
 
+from collections.abc import Iterator
 from typing import Any
 
 import equinox as eqx
@@ -11,8 +12,13 @@ from .bodies import Bodies
 from .start import dependent_equations, LoopClosure
 
 
-_DISPLACEMENT = 1e-2  # of coordinates, m or rad, to poses nearby
 _POSES = 3
+_DISPLACEMENTS = (
+    1e-2,
+    1e-3,
+    1e-4,
+)  # of coordinates, m or rad: the first from which the loops close again
+_CLOSED = 1e-9
 
 
 class Independent(eqx.Module):
@@ -35,11 +41,9 @@ def find_independent(assembly: Any) -> Independent | None:
     x = np.asarray(closure.x)
     _, _, J = closure.known(x)
     number, _ = dependent_equations(J)
-    random = np.random.default_rng(0)
-    for _ in range(_POSES):
-        nearby = closure.closed(x + _DISPLACEMENT * random.normal(size=x.size))
-        _, _, moved = closure.known(nearby)
-        elsewhere, _ = dependent_equations(moved)
+    for nearby in _poses_nearby(closure, x, J):
+        _, _, J_nearby = closure.known(nearby)
+        elsewhere, _ = dependent_equations(J_nearby)
         if elsewhere != number:
             raise ValueError(
                 f"{number} of the {J.shape[0]} equations of the joints depend on others in the drawing, and {elsewhere} "
@@ -57,6 +61,20 @@ def find_independent(assembly: Any) -> Independent | None:
     drives, norms = joints + np.arange(driven), chosen[chosen >= joints] + driven
     rows = np.concatenate([chosen[chosen < joints], drives, norms])
     return Independent(tuple(rows.tolist()))
+
+
+def _poses_nearby(closure: LoopClosure, x: np.ndarray, J: np.ndarray) -> Iterator[np.ndarray]:
+    """Yield poses that are reached by small motions in random directions that the joints allow."""
+    random, free = np.random.default_rng(0), scipy.linalg.null_space(J, rcond=1e-9)
+    for _ in range(_POSES if free.size else 0):
+        direction = free @ random.normal(size=free.shape[1])
+        direction /= np.linalg.norm(direction)
+        for displacement in _DISPLACEMENTS:
+            nearby = closure.closed(x + displacement * direction)
+            residual, _, _ = closure.known(nearby)
+            if np.abs(residual).max(initial=0) < _CLOSED:
+                yield nearby
+                break
 
 
 def _in_drawing(assembly: Any) -> LoopClosure:

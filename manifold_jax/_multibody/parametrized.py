@@ -40,6 +40,11 @@ class _Built(AbstractOfArgs):
             raise TypeError(
                 f"`build` must return an `mj.multibody.Assembly`, got {type(assembly).__name__}."
             )
+        if assembly.independent is not None:
+            raise ValueError(
+                "`build` returns an assembly of `without_dependent_equations`: write `parametrized(build, redundant=True)` with the "
+                "assembly before, or replace its numbers by `eqx.tree_at` and take its `system` inside your function."
+            )
         if assembly.redundant and not self.redundant:
             raise ValueError(
                 "`build` returns an `Assembly(..., redundant=True)`: write `parametrized(build, redundant=True)`, too."
