@@ -33,7 +33,7 @@ class Factorization(eqx.Module):
     The derivative is that of `A x = b`, not of the elimination: five times less to compile.
     """
 
-    A: Float[Array, "m m"]
+    A: Any  # an array, or what `product` multiplies
     factors: Any  # with `solve` and `solve_transposed`; held fixed
     usable: BoolScalar  # full rank
     product: Callable = eqx.field(static=True)  # multiplies `A` by a solution

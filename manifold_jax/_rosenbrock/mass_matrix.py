@@ -104,7 +104,8 @@ class MassMatrixTerm(dfx.AbstractTerm):
     def derivative(self, t: RealScalarLike, y: Y, args: Args = None) -> Y:
         """Return `y'` at a consistent state; not finite where the index is above 1."""
         x, unravel = jfu.ravel_pytree(y)
-        return unravel(self.equations(y, args).at(t, x).derivative)
+        equations = self.equations(y, args).with_sparsity("auto", t, x)
+        return unravel(equations.at(t, x).derivative)
 
     def equations(self, y: Y, args: Args) -> MassMatrixEquations:
         """Return the equations in the vector of all numbers of the state; `y` is an example of a state."""
@@ -125,7 +126,8 @@ def _consistent_state(
     check_state(y, "y")
     y = jtu.tree_map(jnp.asarray, y)
     x, unravel = jfu.ravel_pytree(y)
-    x, info = consistent(term.equations(y, args), t, x)
+    equations = term.equations(y, args).with_sparsity("auto", t, x)
+    x, info = consistent(equations, t, x)
     y = unravel(x)
     if throw:
         y = Diagnosis(*faults_of_start(info)).raise_unless(info.success, y, "y")

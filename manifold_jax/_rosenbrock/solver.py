@@ -16,7 +16,9 @@ from .._base.rejection import is_repeatable, rejecting
 from .._base.types import Args, BoolScalar, FloatScalar, RealScalarLike, Y
 from .._constraint.checks import check_state
 from .._linalg.pivoted import LARGEST_WRITTEN_OUT
+from .._linalg.sparse import Choice
 from .algebraic import is_consistent
+from .sparsity import check_structure
 from .stages import rosenbrock_step
 from .system import System
 from .tableau import RODAS3P, RODAS5P, RosenbrockTableau
@@ -63,9 +65,13 @@ class AbstractRosenbrock(dfx.AbstractAdaptiveSolver):
     system. All have the same matrix `M / gamma - h df/dy`, which is factored once per step."""
 
     tableau: eqx.AbstractClassVar[RosenbrockTableau]
+    structure: Choice = eqx.field(default="auto", static=True)
     checks_start: bool = True  # false if the state has been made consistent before
     # Largest number of rows for which the elimination is written out, without LAPACK.
     largest_written_out: int = eqx.field(default=LARGEST_WRITTEN_OUT, static=True)
+
+    def __check_init__(self):
+        check_structure(self.structure)
 
     term_structure: ClassVar = dfx.AbstractTerm
     interpolation_cls: ClassVar[Callable[..., RosenbrockInterpolation]] = RosenbrockInterpolation
@@ -85,7 +91,7 @@ class AbstractRosenbrock(dfx.AbstractAdaptiveSolver):
         system = System.of(terms, t0, t1, y0, args)
         if system.mass is not None:
             x, _ = jfu.ravel_pytree(y0)
-            start, derivative = system.at_start(x)
+            start, derivative = system.at_start(x, self.structure)
             if self.checks_start:
                 usable = is_consistent(x, start)
             if not callable(system.mass.mass):
@@ -104,8 +110,10 @@ class AbstractRosenbrock(dfx.AbstractAdaptiveSolver):
     ) -> tuple[Y, Y | None, dict[str, Any], RosenbrockState, RESULTS]:
         system = System.of(terms, t0, t1, y0, args)
         x0, unravel = jfu.ravel_pytree(y0)
-        derivative = system.refreshed(made_jump, solver_state.derivative, x0)
-        step = rosenbrock_step(self.tableau, system, x0, derivative, self.largest_written_out)
+        derivative = system.refreshed(made_jump, solver_state.derivative, x0, self.structure)
+        step = rosenbrock_step(
+            self.tableau, system, x0, derivative, self.structure, self.largest_written_out
+        )
         finite = jnp.all(jnp.isfinite(step.x1)) & jnp.all(jnp.isfinite(step.error))
         result = RESULTS.where(finite, RESULTS.successful, RESULTS.nonfinite)  # pyright: ignore[reportArgumentType]
         singular = step.defined & ~step.nonsingular | ~solver_state.usable

@@ -12,6 +12,7 @@ from .._jaxpr.trace import num_equations
 from .._linalg.dense import Factorization
 from .._linalg.pivoted import factorize_pivoted
 from .._linalg.rows import product
+from .._linalg.sparse import Choice, factorize_sparse, SparseMatrix
 from .algebraic import as_matrix
 from .system import System, Vector
 from .tableau import RosenbrockTableau, Row
@@ -40,6 +41,7 @@ def rosenbrock_step(
     system: System,
     x0: Vector,
     derivative: Vector | None,
+    structure: Choice,
     largest_written_out: int,
 ) -> RosenbrockStep:
     r"""Make one step. If `M` depends on time or state, the method is applied to the larger system
@@ -54,13 +56,20 @@ def rosenbrock_step(
     """
     h = system.step.astype(x0.dtype)
     Z0 = None if derivative is None else h * derivative
-    f0, J, T = system.linearized(x0, Z0)
+    sparsity = system.sparsity(structure, x0, Z0)
+    f0, J, T = system.linearized(x0, Z0, sparsity)
     M0 = system.mass_at(system.t0, x0)
-    mass = as_matrix(jnp.ones((), J.dtype) if M0 is None else M0, x0.size)
-    factor = factorize_pivoted(mass / tableau.gamma - J, largest_written_out)
+    mass = jnp.ones((), x0.dtype) if M0 is None else M0
+    if sparsity is None:
+        A = as_matrix(mass, x0.size) / tableau.gamma - J
+        factor = factorize_pivoted(A, largest_written_out)
+    else:
+        A = SparseMatrix.of_mass(mass, sparsity.pattern) / tableau.gamma - J
+        factor = factorize_sparse(A, sparsity.method)
     stages = _Stages(tableau, system, factor, x0, Z0, M0, T)
-    U, V = stages.in_a_loop(f0) if stages.are_long else stages.written_out(f0)
-    finite = [jnp.all(jnp.isfinite(value)) for value in (f0, J, T)]
+    in_a_loop = sparsity is not None or stages.are_long
+    U, V = stages.in_a_loop(f0) if in_a_loop else stages.written_out(f0)
+    finite = [jnp.all(jnp.isfinite(value)) for value in (f0, *jtu.tree_leaves(J), T)]
     # A lane of a batch that has finished makes steps of length zero.
     after = None if Z0 is None else _plus(Z0, tableau.m, V) / jnp.where(h == 0, 1, h)
     return RosenbrockStep(

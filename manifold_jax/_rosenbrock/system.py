@@ -11,8 +11,10 @@ from jaxtyping import Array, Float
 from .._base.compat import directed, time_direction, undirected
 from .._base.types import Args, RealScalarLike, Y
 from .._linalg.rows import product
+from .._linalg.sparse import Choice, SparseMatrix
 from .algebraic import LinearizedEquations
 from .mass_matrix import mass_values, MassMatrixTerm, ravelled_like
+from .sparsity import choose_sparsity, Sparsity
 
 
 Vector = Float[Array, " n"]
@@ -59,9 +61,22 @@ class System(NamedTuple):
         true_time = t * time_direction(self.terms)
         return mass_values(self.mass.mass, true_time, self._unravel(x), self.args)
 
+    def sparsity(
+        self, choice: Choice, x0: Vector, displacement: Vector | None
+    ) -> Sparsity | None:
+        """Return how the linear systems of the step are solved."""
+        mass = self.mass_at(self.t0, x0)
+        if displacement is None:
+            return choose_sparsity(choice, lambda x: self.increment(self.t0, x), x0, mass)
+
+        def both(x: Vector) -> Vector:
+            return self.increment(self.t0, x) + product(self.mass_at(self.t0, x), displacement)  # pyright: ignore[reportArgumentType]
+
+        return choose_sparsity(choice, both, x0, mass)
+
     def linearized(
-        self, x0: Vector, displacement: Vector | None
-    ) -> tuple[Vector, Float[Array, "n n"], Vector]:
+        self, x0: Vector, displacement: Vector | None, sparsity: Sparsity | None = None
+    ) -> tuple[Vector, Any, Vector]:
         """Return `h f`, its Jacobian and `h` times its derivative by time at the beginning; if the mass
         depends on the state, the derivatives are those of `h f - M displacement`."""
 
@@ -73,21 +88,28 @@ class System(NamedTuple):
 
         t0 = jnp.asarray(self.t0)
         _, column, f0 = jax.linearize(lambda x: rest(t0, x), x0, has_aux=True)
-        J = jax.vmap(column, out_axes=1)(jnp.eye(x0.size, dtype=x0.dtype))
+        if sparsity is None:
+            J = jax.vmap(column, out_axes=1)(jnp.eye(x0.size, dtype=x0.dtype))
+        else:
+            J = SparseMatrix.of_columns(column, sparsity.pattern, x0.dtype)
         _, T = jax.jvp(lambda t: rest(t, x0)[0], (t0,), (self.step.astype(t0.dtype),))
         return f0, J, T
 
-    def at_start(self, x0: Vector) -> tuple[LinearizedEquations, Vector]:
+    def at_start(self, x0: Vector, choice: Choice) -> tuple[LinearizedEquations, Vector]:
         """Return the equations and the mass matrix at the beginning, and `y'` in the step's direction."""
         direction = time_direction(self.terms)
-        at = self.mass.equations(self.y0, self.args).at(self.t0 * direction, x0)  # pyright: ignore
+        t0 = self.t0 * direction
+        equations = self.mass.equations(self.y0, self.args)  # pyright: ignore[reportOptionalMemberAccess]
+        at = equations.with_sparsity(choice, t0, x0).at(t0, x0)
         return at, at.derivative * jnp.asarray(direction, x0.dtype)
 
-    def refreshed(self, made_jump: Any, derivative: Vector | None, x0: Vector) -> Vector | None:
+    def refreshed(
+        self, made_jump: Any, derivative: Vector | None, x0: Vector, choice: Choice
+    ) -> Vector | None:
         """Return the carried derivative `y'`, evaluated again after a jump of the field."""
         if derivative is None or made_jump is False:
             return derivative
-        return jax.lax.cond(made_jump, lambda: self.at_start(x0)[1], lambda: derivative)
+        return jax.lax.cond(made_jump, lambda: self.at_start(x0, choice)[1], lambda: derivative)
 
     def _unravel(self, x: Vector) -> Y:
         return jfu.ravel_pytree(self.y0)[1](x)

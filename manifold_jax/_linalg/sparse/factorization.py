@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 from ..._base.types import BoolScalar, FloatScalar
 from ..newton import without_derivative
 from ..rows import AbstractRows
+from .block_order import BlockOrder
 from .elimination import Blocks, eliminate
 from .structure import Structure
 
@@ -60,28 +61,25 @@ class BlockFactorization(eqx.Module):
         """Solve with one step of iterative refinement: the products of `multiply` are more accurate
         than the rounded entries of the matrix, and near singular positions that recovers a third of the
         digits. Not done for tridiagonal matrices."""
-        x = _in_order(self.structure, eliminated, b)
-        if self.structure.width == 1:
+        x = solve_in_blocks(self.structure.block_order, eliminated, b)
+        if self.structure.block_order.width == 1:
             return x
-        return x + _in_order(self.structure, eliminated, b - multiply(x))
+        return x + solve_in_blocks(self.structure.block_order, eliminated, b - multiply(x))
 
     def solves(self, residual: Float[Array, " m"], size2: FloatScalar) -> BoolScalar:
         """Whether a refinement `x' = A^-1 r` would be small: `r . x' = x' . A x'` compared with
         `x . A x` of the solutions, `size2`. If so, the rank is full, no entry is missing, and `A` is
         not too ill conditioned for the elimination, or else `A x = b` nevertheless."""
         r = jax.lax.stop_gradient(residual)
-        change2 = jnp.abs(jnp.dot(r, _in_order(self.structure, self.eliminated, r)))
+        change2 = jnp.abs(jnp.dot(r, solve_in_blocks(self.structure.block_order, self.eliminated, r)))
         tolerance = float(jnp.finfo(r.dtype).eps) ** (1 / 3)
         return change2 <= tolerance**2 * jax.lax.stop_gradient(size2)
 
     @property
     def lengths(self) -> Float[Array, " m"]:
         """Return the lengths of the gradients, in the metric of the directions."""
-        structure = self.structure
-        diagonal = jnp.diagonal(self.blocks.diagonal, axis1=1, axis2=2).reshape(-1)
-        diagonal = diagonal[: structure.num_equations]
-        if structure.place is not None:
-            diagonal = diagonal[_places(structure)]
+        diagonal = jnp.diagonal(self.blocks.diagonal, axis1=1, axis2=2)
+        diagonal = self.structure.block_order.out_of_blocks(diagonal)
         return jnp.sqrt(jnp.where(diagonal > 0, diagonal, 1))
 
     def _is_right(self, product: Any) -> BoolScalar:
@@ -96,41 +94,23 @@ class BlockFactorization(eqx.Module):
         return error <= float(jnp.finfo(lengths.dtype).eps) ** (1 / 4)
 
 
-def _places(structure: Structure) -> Array:
-    """Return the places of the equations in the order of elimination. A barrier keeps the compiler from
-    evaluating all that depends on them at compile time, slowly."""
-    if structure.place is None:
-        return jax.lax.optimization_barrier(jnp.arange(structure.num_equations, dtype=jnp.int32))
-    return jax.lax.optimization_barrier(jnp.asarray(structure.place))
-
-
 def _blocks(product: Any, structure: Structure, dtype: Any) -> Blocks:
     """Compute one column of every third block at a time: blocks of the same one of three colors have no
     rows in common."""
-    width, groups = structure.width, structure.num_blocks // 3
-    places = _places(structure)
+    order = structure.block_order
+    width, groups, places = order.width, order.num_blocks // 3, order.places
     wanted = jnp.arange(3 * width, dtype=jnp.int32)[:, None]
     column = (places // width) % 3 * width + places % width
     products = jax.vmap(product)((column[None, :] == wanted).astype(dtype))
-    missing = 3 * groups * width - structure.num_equations
-    products = jnp.pad(_ordered(structure, products.T), ((0, missing), (0, 0)))
+    products = jnp.pad(order.ordered(products.T), ((0, order.num_padded), (0, 0)))
     entries = products.reshape(groups, 3, width, 3, width)  # block, row; color, column
     beside = lambda shift: jnp.stack(
         [entries[:, r, :, (r + shift) % 3, :] for r in range(3)], axis=1
     ).reshape(3 * groups, width, width)
-    is_padding = (jnp.arange(3 * groups * width) >= structure.num_equations).astype(dtype)
+    is_padding = (jnp.arange(3 * groups * width) >= order.size).astype(dtype)
     diagonal = beside(0) + jax.vmap(jnp.diag)(is_padding.reshape(-1, width))
     return Blocks(beside(-1), diagonal, beside(1))
 
 
-def _ordered(structure: Structure, b: Float[Array, "m ..."]) -> Float[Array, "m ..."]:
-    if structure.order is None:
-        return b
-    return b[jax.lax.optimization_barrier(jnp.asarray(structure.order))]
-
-
-def _in_order(structure: Structure, eliminated: Any, b: Float[Array, " m"]) -> Float[Array, " m"]:
-    m, width = structure.num_equations, structure.width
-    padded = jnp.pad(_ordered(structure, b), (0, structure.num_blocks * width - m))
-    z = eliminated.solve(padded.reshape(-1, width)).reshape(-1)[:m]
-    return z if structure.place is None else z[_places(structure)]
+def solve_in_blocks(order: BlockOrder, eliminated: Any, b: Float[Array, " m"]) -> Float[Array, " m"]:
+    return order.out_of_blocks(eliminated.solve(order.in_blocks(b)))

@@ -9,9 +9,9 @@ import jax.core
 import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Array, Float
-from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from ..coloring import greedy_colors
+from .block_order import BlockOrder
 from .pattern import dependence
 
 
@@ -27,9 +27,7 @@ class Structure:
     """The sparsity structure of `m` equations in `n` unknowns, of which `per_block` neighbours have
     masses that are coupled.
 
-    - `order`: the order of the equations in which `C M^-1 C^T` is block tridiagonal, and `place` of each
-        of them in it; `None` if it is their own order.
-    - `width`: the size of the blocks.
+    - `block_order`: the order of the equations in which `C M^-1 C^T` is block tridiagonal.
     - `color`: of each unknown; no equation depends on two of the same color.
     - `local`: the equations that depend on unknowns of one block of masses only.
     """
@@ -39,8 +37,7 @@ class Structure:
         self._depends, self._per_block = depends, per_block
         blocks = _merged(depends, per_block)
         coupled = (blocks @ blocks.T).tocoo()
-        self.order, self.width = _best_order(coupled)
-        self.place = None if self.order is None else np.argsort(self.order).astype(np.int32)
+        self.block_order = BlockOrder.best(coupled)
         self.local = np.diff(blocks.indptr) == 1
 
     @functools.cached_property
@@ -63,11 +60,6 @@ class Structure:
     @property
     def num_colors(self) -> int:
         return int(self.color.max(initial=0)) + 1
-
-    @property
-    def num_blocks(self) -> int:
-        """Return the number of blocks, rounded up to a multiple of three, for three colors."""
-        return 3 * -(-self.num_equations // (3 * self.width))
 
 
 def check_choice(structure: Any, redundant: bool) -> None:
@@ -99,11 +91,11 @@ def choose_structure(
         return None
     structure = structure_of(equations, per_block)
     if choice == "auto":
-        return None if structure is None or structure.width > m * _WIDEST else structure
-    if structure is None or (m > _SMALLEST and 3 * structure.width > m):
+        return None if structure is None or structure.block_order.width > m * _WIDEST else structure
+    if structure is None or (m > _SMALLEST and 3 * structure.block_order.width > m):
         found = "most of them depend on most coordinates"
         if structure is not None:
-            found = f"reordered, they are coupled in blocks of {structure.width}"
+            found = f"reordered, they are coupled in blocks of {structure.block_order.width}"
         raise ValueError(_NOT_SPARSE.format(m=m, found=found))
     return structure
 
@@ -125,7 +117,7 @@ _MOST_FOUND = 64
 def structure_of(equations: Any, per_block: int = 1) -> Structure | None:
     """Return the structure as for `choose_structure`, if there is any. It is cached for each traced
     program, which is evaluated in many places."""
-    key = per_block, *(_program(function, x) for function, x in equations)
+    key = per_block, *(program_of(function, x) for function, x in equations)
     if key not in _FOUND:
         patterns = [dependence(function, x) for function, x in equations]
         structure = None
@@ -137,7 +129,7 @@ def structure_of(equations: Any, per_block: int = 1) -> Structure | None:
     return _FOUND[key]
 
 
-def _program(function: Callable, x: Float[Array, " n"]) -> tuple:
+def program_of(function: Callable, x: Float[Array, " n"]) -> tuple:
     """Return the traced function as text, and the constants in it."""
     closed = jax.make_jaxpr(function)(x)
     return str(closed.jaxpr), *(_constant(value) for value in closed.consts)
@@ -159,19 +151,3 @@ def _merged(depends: sp.csr_matrix, per_block: int) -> sp.csr_matrix:
     joined = sp.csr_matrix((entries.data, (entries.row, entries.col // per_block)), shape)
     joined.sum_duplicates()
     return joined.astype(np.int64)  # pyright: ignore[reportReturnType]
-
-
-def _best_order(coupled: sp.coo_matrix) -> tuple[np.ndarray | None, int]:
-    """Return the given order, or that of Cuthill and McKee (Proc. 24th ACM Nat. Conf. (1969) 157-172)."""
-    own = np.arange(coupled.shape[0])  # pyright: ignore[reportOptionalSubscript]
-    order = np.asarray(reverse_cuthill_mckee(coupled.tocsr(), symmetric_mode=True))
-    given, reordered = _width(coupled, own), _width(coupled, np.argsort(order))
-    return (None, given) if given <= reordered else (order, reordered)
-
-
-def _width(coupled: sp.coo_matrix, place: np.ndarray) -> int:
-    """Return the smallest size of blocks for which the matrix is block tridiagonal."""
-    i, j = place[coupled.row], place[coupled.col]
-    band = max(1, int(np.abs(i - j).max(initial=1)))
-    fits = lambda width: np.abs(i // width - j // width).max(initial=0) <= 1
-    return next(width for width in range((band + 1) // 2, band + 1) if fits(width))

@@ -1,0 +1,117 @@
+"""Whether the linear systems of a step are solved with sparse matrices, and how."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax.core
+import numpy as np
+import scipy.sparse as sp
+from jaxtyping import Array, Float
+
+from .._base.klu import has_klu
+from .._linalg.sparse import Choice, dependence, Method, program_of, SquarePattern
+
+
+# Number of unknowns from which on sparse systems are solved as such, and the largest number of colors as
+# a part of it.
+SMALLEST = 48
+_MOST_COLORS = 1 / 3
+# The largest width of blocks, as a part of the number of unknowns, for which they are eliminated.
+_WIDEST = 1 / 6
+
+
+class Sparsity(NamedTuple):
+    """Where the matrices of a step have entries, and how their systems are solved."""
+
+    pattern: SquarePattern
+    method: Method
+
+
+def check_structure(structure: Any) -> None:
+    if structure not in ("auto", "dense", "sparse"):
+        raise ValueError(f"`structure` must be 'auto', 'dense' or 'sparse', got {structure!r}.")
+
+
+def choose_sparsity(
+    choice: Choice,
+    function: Callable[[Float[Array, " n"]], Float[Array, " n"]],
+    x: Float[Array, " n"],
+    mass: Float[Array, "..."] | None,
+) -> Sparsity | None:
+    """Return how systems with the matrix `M / gamma - h df/dx` are solved; `None` for dense matrices.
+    `function` is `f` and whatever else the state has to do with in the equations."""
+    n = x.size
+    if choice == "dense" or (choice == "auto" and n < SMALLEST):
+        return None
+    pattern = _found(function, x, mass)
+    if choice == "auto":
+        if pattern is None or pattern.num_colors > _MOST_COLORS * n:
+            return None
+        method = _method(pattern, x.dtype, _is_regular(mass))
+        return None if method is None else Sparsity(pattern, method)
+    if pattern is None:
+        raise ValueError(_NOT_SPARSE.format(n=n))
+    method = _method(pattern, x.dtype, True)
+    if method is None:
+        raise ValueError(_NO_LIBRARY.format(width=pattern.block_order.width))
+    return Sparsity(pattern, method)
+
+
+_NOT_SPARSE = (
+    "`structure='sparse'`, but most of the {n} equations of `terms` depend on most numbers of `y`, as far as can be seen "
+    "from the traced function. Write the indices and sparse matrices in them as NumPy arrays that the function closes "
+    "over, not in `args`, or use `structure='dense'`."
+)
+_NO_LIBRARY = (
+    "`structure='sparse'`, but reordered the equations of `terms` are coupled in blocks of {width}, too wide to be "
+    "eliminated without a library. Install klujax (`pip install klujax`, the extra `manifold_jax[sparse]`; for CPUs "
+    "and 64-bit numbers), or use `structure='dense'`."
+)
+
+
+def _method(pattern: SquarePattern, dtype: Any, regular: bool) -> Method | None:
+    """Blocks are eliminated without exchanges of rows between them, which is safe for small steps if the
+    mass matrix is regular."""
+    narrow = pattern.block_order.width <= _WIDEST * pattern.size
+    if narrow and regular:
+        return "blocks"
+    return "klu" if has_klu(dtype) else None
+
+
+def _is_regular(mass: Float[Array, "..."] | None) -> bool:
+    """Whether a mass matrix is known to be the identity or a diagonal without zeros."""
+    if mass is None:
+        return True
+    if isinstance(mass, jax.core.Tracer) or mass.ndim == 2:
+        return False
+    return bool(np.all(np.asarray(mass) != 0))
+
+
+_FOUND: dict[Any, SquarePattern | None] = {}
+_MOST_FOUND = 64
+
+
+def _found(
+    function: Callable, x: Float[Array, " n"], mass: Float[Array, "..."] | None
+) -> SquarePattern | None:
+    """Return the pattern, which is cached for each traced program."""
+    functions = [function]
+    if mass is not None and mass.ndim == 2:
+        functions.append(lambda x: mass @ x)
+    key = tuple(program_of(f, x) for f in functions)
+    if key not in _FOUND:
+        while len(_FOUND) >= _MOST_FOUND:
+            _FOUND.pop(next(iter(_FOUND)))
+        _FOUND[key] = _pattern(functions, x)
+    return _FOUND[key]
+
+
+def _pattern(functions: list[Callable], x: Float[Array, " n"]) -> SquarePattern | None:
+    try:
+        found = [dependence(function, x) for function in functions]
+    except TypeError:  # `jax.custom_vjp`, which cannot be differentiated forwards
+        return None
+    if any(entries is None for entries in found):
+        return None
+    total: Any = sum(entries.astype(np.int64) for entries in found)  # pyright: ignore
+    return SquarePattern(sp.csr_matrix(total))
