@@ -92,11 +92,13 @@ def test_orders():
     difference = lambda x: jnp.diff(x)[order]
     depends = pattern.dependence(difference, jnp.zeros(n))
     found = structure.Structure(depends, 1)
-    assert found.width == 1
+    assert found.block_order.width == 1
     assert found.num_colors == 2
-    np.testing.assert_array_equal(found.order[found.place], np.arange(n - 1))
+    np.testing.assert_array_equal(
+        found.block_order.order[found.block_order.places], np.arange(n - 1)
+    )
     closed = sp.csr_matrix(np.eye(n, dtype=bool) | np.roll(np.eye(n, dtype=bool), 1, axis=1))
-    assert structure.Structure(closed, 1).width == 2
+    assert structure.Structure(closed, 1).block_order.width == 2
 
 
 ORDER = np.random.default_rng(0).permutation(7)

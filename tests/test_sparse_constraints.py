@@ -47,7 +47,7 @@ def test_a_solve_and_its_gradients():
     y0 = start(lengths) + 0.01
     loss = lambda choice: lambda y0, lengths: jnp.sum(jnp.sin(end(choice, y0, lengths)))
     both = {c: jax.jit(jax.value_and_grad(loss(c), (0, 1))) for c in ("auto", "dense")}
-    assert mj.Constraint(bonds).structure_at(0.0, y0, lengths).width == 1
+    assert mj.Constraint(bonds).structure_at(0.0, y0, lengths).block_order.width == 1
     assert mj.Constraint(bonds, structure="dense").structure_at(0.0, y0, lengths) is None
     value, gradient = both["auto"](y0, lengths)
     expected, by_matrices = both["dense"](y0, lengths)

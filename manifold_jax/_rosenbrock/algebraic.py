@@ -14,12 +14,12 @@ Newton's step $-A^{-1} s P D f$ for the algebraic equations, which leaves $M y$ 
 null vector $u(t, y)$, differentiated, replaces the derivative of $u$ by that of $M$.)
 """
 
-import functools
 from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from .._base.closure import convert_closure
@@ -27,7 +27,9 @@ from .._base.types import BoolScalar, FloatScalar, IntScalar, RealScalarLike
 from .._constraint.projection_info import ProjectionInfo
 from .._linalg.newton import root_of_step
 from .._linalg.pivoted import factorize_pivoted
-from .._linalg.sparse import Choice, factorize_sparse, SparseMatrix
+from .._linalg.sparse import Choice
+from .linearized import LinearizedEquations as LinearizedEquations, relative_residual
+from .sparse_equations import linearize_sparse
 from .sparsity import choose_sparsity, Sparsity
 
 
@@ -47,76 +49,27 @@ _FAULTS = (
 INCONSISTENT = 3
 
 
-class LinearizedEquations(NamedTuple):
-    """The equations linearized at one time and state.
-
-    - `derivative`: `y'`.
-    - `newton`: Newton's step towards consistency.
-    - `kept`: `A^-1 M change`; added to `newton`, the step to the solution that has the `M y` of a state
-        which differs by `change`.
-    - `residual`: the largest residual of an algebraic equation, relative to its change when the unknowns
-        change by `|x| + 1`. Rounding of the state leaves a few units of it, but far more of `newton` where
-        equations are badly conditioned.
-    - `finite`, `nonsingular`: whether the equations are defined there, and of index 1.
-    """
-
-    derivative: Float[Array, " n"]
-    newton: Float[Array, " n"]
-    kept: Callable[[Float[Array, " n"]], Float[Array, " n"]]
-    residual: FloatScalar
-    finite: BoolScalar
-    nonsingular: BoolScalar
-
-
 class MassMatrixEquations(NamedTuple):
-    """`field(t, x)` and `mass(t, x)`, a scalar, a diagonal or a matrix, and whether the linear systems are
-    sparse."""
+    """`field(t, x)` and `mass(t, x)`, a scalar, a diagonal or a matrix, which numbers of a diagonal are known
+    to be zero, and whether the linear systems are sparse."""
 
     field: Callable[[RealScalarLike, Float[Array, " n"]], Float[Array, " n"]]
     mass: Callable[[RealScalarLike, Float[Array, " n"]], Float[Array, "..."]]
+    massless: np.ndarray | None = None
     sparsity: Sparsity | None = None
 
     def with_sparsity(
         self, choice: Choice, t: RealScalarLike, x: Float[Array, " n"]
     ) -> "MassMatrixEquations":
         """Return the equations with sparse linear systems if the choice and their structure allow it."""
-        field = lambda x: self.field(t, x)
-        return self._replace(sparsity=choose_sparsity(choice, field, x, self.mass(t, x)))
+        field, mass = lambda x: self.field(t, x), self.mass(t, x)
+        return self._replace(sparsity=choose_sparsity(choice, field, x, mass, self.massless))
 
     def at(self, t: RealScalarLike, x: Float[Array, " n"]) -> LinearizedEquations:
         """Linearize the equations at one time and state."""
-        return (self._dense if self.sparsity is None else self._sparse)(t, x)
-
-    def _sparse(self, t: RealScalarLike, x: Float[Array, " n"]) -> LinearizedEquations:
-        """Do it for algebraic equations whose rows of `M` are zero, as they are in sparse systems: then
-        $P$ selects these rows, and $P \\partial (M \\hat z) = 0$."""
-        pattern, method = self.sparsity  # pyright: ignore[reportGeneralTypeIssues]
-        f, M = self.field(t, x), SparseMatrix.of_mass(self.mass(t, x), pattern)
-        t = jnp.asarray(t, jnp.result_type(float, t))
-        column = jax.linearize(lambda x: self.field(t, x), x)[1]
-        ft = jax.jvp(lambda t: self.field(t, x), (t,), (jnp.ones_like(t),))[1]
-        size = jax.lax.stop_gradient(M.over_rows(jax.ops.segment_max, jnp.abs(M.entries)))
-        P = (size == 0).astype(x.dtype)
-        D = 1 / jnp.where(size > 0, size, 1)
-        K = SparseMatrix.of_columns(column, pattern, x.dtype).scaled_rows(P)
-        largest = jax.lax.stop_gradient(jnp.max(jnp.abs(K.entries), initial=0.0))
-        s = jnp.where(largest > 0, 1 / jnp.where(largest > 0, largest, 1), 1)
-        factor = factorize_sparse(M.scaled_rows(D) + K.scaled_rows(s * P), method)
-        finite = [jnp.all(jnp.isfinite(v)) for v in (f, M.entries, K.entries, P * ft)]
-        finite = functools.reduce(jnp.logical_and, finite)
-        nonsingular = finite & factor.usable
-        nan = jnp.where(nonsingular, 0.0, jnp.nan).astype(x.dtype)
-        r, K = P * f, jax.lax.stop_gradient(K)
-        reach = jax.lax.stop_gradient(jnp.abs(x) + 1)
-        reach = SparseMatrix(jnp.abs(K.entries), pattern).multiply(reach)
-        return LinearizedEquations(
-            factor.solve((1 - P) * D * f - s * P * ft) + nan,
-            -factor.solve(s * r) + nan,
-            lambda change: factor.solve(M.scaled_rows(D).multiply(change)),
-            _relative_residual(jax.lax.stop_gradient(r), reach) + nan,
-            finite,
-            nonsingular,
-        )
+        if self.sparsity is None:
+            return self._dense(t, x)
+        return linearize_sparse(self.field, self.mass(t, x), self.sparsity, t, x)
 
     def _dense(self, t: RealScalarLike, x: Float[Array, " n"]) -> LinearizedEquations:
         f, M = self.field(t, x), as_matrix(self.mass(t, x), x.size)
@@ -144,7 +97,7 @@ class MassMatrixEquations(NamedTuple):
             factor.solve(M @ z - s * Kt) + nan,
             -factor.solve(s * r) + nan,
             lambda change: factor.solve(M @ change),
-            _relative_residual(*jax.lax.stop_gradient((r, jnp.abs(K) @ (jnp.abs(x) + 1)))) + nan,
+            relative_residual(*jax.lax.stop_gradient((r, jnp.abs(K) @ (jnp.abs(x) + 1)))) + nan,
             finite,
             nonsingular,
         )
@@ -181,10 +134,6 @@ def _is_nonsingular(A: Float[Array, "n n"]) -> BoolScalar:
         A = A / jnp.where(size > 0, size, 1)
     values = jnp.linalg.svd(A, compute_uv=False)
     return values[-1] > 100 * A.shape[0] * jnp.finfo(A.dtype).eps * values[0]
-
-
-def _relative_residual(r: Float[Array, " n"], size: Float[Array, " n"]) -> FloatScalar:
-    return jnp.max(jnp.where(r == 0, 0, jnp.abs(r) / size), initial=0.0)
 
 
 def relative_size(change: Float[Array, " n"], x: Float[Array, " n"]) -> FloatScalar:

@@ -5,9 +5,11 @@ from typing import Any, NoReturn
 
 import diffrax as dfx
 import equinox as eqx
+import jax.core
 import jax.flatten_util as jfu
 import jax.numpy as jnp
 import jax.tree_util as jtu
+import numpy as np
 from jaxtyping import Array, Float
 
 from .._base.errors import clear_errors
@@ -57,6 +59,8 @@ class MassMatrixTerm(dfx.AbstractTerm):
 
     vector_field: Callable[[RealScalarLike, Y, Args], Y]
     mass: Any
+    # Which numbers of a diagonal are zero, packed, if that was known outside of compiled programs.
+    packed_massless: bytes | None = eqx.field(static=True)
 
     def __init__(self, vector_field: Callable[[RealScalarLike, Y, Args], Y], mass: Any):
         check_function("vector_field", vector_field, "f(t, y, args)")
@@ -66,6 +70,7 @@ class MassMatrixTerm(dfx.AbstractTerm):
             _check_numbers(mass)
         self.vector_field = vector_field
         self.mass = mass
+        self.packed_massless = _packed_massless(mass)
 
     def vf(self, t: RealScalarLike, y: Y, args: Args) -> Y:
         return self.vector_field(t, y, args)
@@ -114,7 +119,28 @@ class MassMatrixTerm(dfx.AbstractTerm):
         def field(t: RealScalarLike, x: Float[Array, " n"]) -> Float[Array, " n"]:
             return ravelled_like(y, self.vector_field(t, unravel(x), args))
 
-        return MassMatrixEquations(field, lambda t, x: mass_values(self.mass, t, unravel(x), args))
+        mass = lambda t, x: mass_values(self.mass, t, unravel(x), args)
+        return MassMatrixEquations(field, mass, self.massless(jfu.ravel_pytree(y)[0].size))
+
+    def massless(self, n: int) -> np.ndarray | None:
+        """Return which of the `n` numbers on the diagonal are zero, `None` if that is not known."""
+        if self.packed_massless is None:
+            return None
+        surplus, packed = self.packed_massless[0], self.packed_massless[1:]
+        bits = np.unpackbits(np.frombuffer(packed, np.uint8), count=8 * len(packed) - surplus)
+        known = bits.astype(bool)
+        return np.broadcast_to(known, (n,)) if known.size in (1, n) else None
+
+
+def _packed_massless(mass: Any) -> bytes | None:
+    """Pack the zeros of numbers on a diagonal, if they are known, behind the number of bits that complete
+    the last byte."""
+    leaves = jtu.tree_leaves(mass)
+    is_matrix = len(leaves) == 1 and leaves[0] is mass and np.ndim(mass) == 2
+    if callable(mass) or is_matrix or any(isinstance(x, jax.core.Tracer) for x in leaves):
+        return None
+    zero = np.concatenate([np.ravel(np.asarray(leaf)) == 0 for leaf in leaves])
+    return bytes([-zero.size % 8]) + np.packbits(zero).tobytes()
 
 
 @clear_errors

@@ -136,7 +136,20 @@ class Rodas5P(AbstractRosenbrock):
 
     Each step evaluates the exact Jacobian once (forward mode, also by time), factors one matrix
     $M/\gamma - h\, \partial f/\partial y$ and solves with it once per stage: nothing is
-    iterated. Small systems are solved by written-out arithmetic, without LAPACK.
+    iterated. Small systems are solved by written-out arithmetic, without LAPACK; large sparse ones
+    (discretized partial differential equations, circuits, networks) at a cost that grows with the
+    number of unknowns, see `structure`.
+
+    **Arguments:**
+
+    - `structure`: how the linear systems of a step are solved. Which equation depends on which unknown
+        is found from the traced vector field, the Jacobian has one column for all unknowns of a
+        color, and the matrix is eliminated in blocks if the unknowns, reordered, are coupled with
+        near ones, else by KLU if klujax is installed (the extra `sparse`; CPUs and 64-bit
+        numbers). `"auto"` does so from 48 unknowns on where the structure allows, `"dense"` never,
+        `"sparse"` always, with an error where it cannot. Masses that are matrices are sparse only
+        on request, and with rows of zeros for the algebraic equations. Sparse matrices and indices
+        in `f` should be NumPy arrays that the function closes over: in `args` they are not known.
 
     Works as any solver of Diffrax: with `diffrax.diffeqsolve` and [`mj.diffeqsolve`][],
     forwards and backwards in time, in [`Projected`][] (also with a mass matrix),
@@ -149,17 +162,24 @@ class Rodas5P(AbstractRosenbrock):
     \varphi'(t)$ (Prothero & Robinson), have errors of order $h^3 / |\lambda|$ while
     $h |\lambda| \gg 1$, where the stage order shows, and $h^5$ below.
 
+    Every sparse factorization is checked by a system with a known solution; a step in which the
+    check fails is repeated with a smaller one, and ends with `RESULTS.nonlinear_divergence` where
+    that does not help: then use `structure="dense"`.
+
     Prefer [`Rodas3P`][] for tolerances of 1e-3 and above, `diffrax.Kvaerno5()` where the Jacobian is
     far more expensive than the vector field, `diffrax.Tsit5()` where nothing is stiff.
 
     **Raises:**
 
-    `ValueError` for terms with noise or controls. At run time `RESULTS.nonlinear_divergence`
+    `ValueError` for terms with noise or controls, and for `structure="sparse"` where most equations
+    depend on most unknowns, where they are structurally singular, or where a library is needed that is
+    not installed. At run time `RESULTS.nonlinear_divergence`
     where the matrix is singular at all step sizes, or the initial value is not consistent (see
     [`MassMatrixTerm`][]), and `RESULTS.nonfinite` where `f` is not finite at an accepted state.
 
     Source: Steinebach, BIT Numer. Math. 63:27 (2023); coefficients as published there, dense output
-    included. Hairer & Wanner, Solving ODEs II, IV.7 and VI.4 (methods and their implementation).
+    included. Hairer & Wanner, Solving ODEs II, IV.7 and VI.4 (methods and their implementation); Curtis, Powell & Reid, J. Inst. Maths Applics
+    13 (1974) 117-119 (colors).
     """
 
     tableau: ClassVar[RosenbrockTableau] = RODAS5P

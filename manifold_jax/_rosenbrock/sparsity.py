@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import jax.core
+import jax.numpy as jnp
 import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Array, Float
@@ -37,30 +37,50 @@ def choose_sparsity(
     function: Callable[[Float[Array, " n"]], Float[Array, " n"]],
     x: Float[Array, " n"],
     mass: Float[Array, "..."] | None,
+    massless: np.ndarray | None = None,
 ) -> Sparsity | None:
     """Return how systems with the matrix `M / gamma - h df/dx` are solved; `None` for dense matrices.
-    `function` is `f` and whatever else the state has to do with in the equations."""
-    n = x.size
-    if choice == "dense" or (choice == "auto" and n < SMALLEST):
+    `function` is `f` and whatever else the state has to do with in the equations. `massless` says of
+    a diagonal which of its numbers are known to be zero.
+
+    Blocks are eliminated without exchanges of rows between them: right for small steps with a regular
+    mass matrix, and otherwise in general if each equation has an unknown of its own. Each
+    factorization is checked, see [`factorize_sparse`][].
+    """
+    n, is_matrix = x.size, mass is not None and mass.ndim == 2
+    if choice == "dense" or (choice == "auto" and (n < SMALLEST or is_matrix)):
         return None
-    pattern = _found(function, x, mass)
-    if choice == "auto":
-        if pattern is None or pattern.num_colors > _MOST_COLORS * n:
-            return None
-        method = _method(pattern, x.dtype, _is_regular(mass))
-        return None if method is None else Sparsity(pattern, method)
-    if pattern is None:
-        raise ValueError(_NOT_SPARSE.format(n=n))
-    method = _method(pattern, x.dtype, True)
-    if method is None:
+    pattern = _found(function, x, mass, massless)
+    if pattern is None or (pattern.num_colors > _MOST_COLORS * n and n > SMALLEST):
+        if choice == "sparse":
+            raise ValueError(_NOT_SPARSE.format(n=n))
+        return None
+    if pattern.transversal is None:
+        if choice == "sparse":
+            raise ValueError(_SINGULAR)
+        return None
+    with_klu = has_klu(x.dtype)
+    narrow = pattern.block_order.width <= _WIDEST * n
+    is_regular = mass is None or (massless is not None and not massless.any())
+    needs_no_exchanges = is_regular or len(pattern.on_diagonal) == n
+    if narrow and (needs_no_exchanges or (choice == "sparse" and not with_klu)):
+        return Sparsity(pattern, "blocks")
+    if with_klu:
+        return Sparsity(pattern, "klu")
+    if choice == "sparse":
         raise ValueError(_NO_LIBRARY.format(width=pattern.block_order.width))
-    return Sparsity(pattern, method)
+    return None
 
 
 _NOT_SPARSE = (
     "`structure='sparse'`, but most of the {n} equations of `terms` depend on most numbers of `y`, as far as can be seen "
     "from the traced function. Write the indices and sparse matrices in them as NumPy arrays that the function closes "
     "over, not in `args`, or use `structure='dense'`."
+)
+_SINGULAR = (
+    "`structure='sparse'`, but the equations of `terms` are structurally singular: however the unknowns are assigned to "
+    "the equations, one of the equations is left without an unknown of its own. The index is above 1: reduce it, for "
+    "example with `mj.reduce_dae`, or remove what is redundant."
 )
 _NO_LIBRARY = (
     "`structure='sparse'`, but reordered the equations of `terms` are coupled in blocks of {width}, too wide to be "
@@ -69,35 +89,21 @@ _NO_LIBRARY = (
 )
 
 
-def _method(pattern: SquarePattern, dtype: Any, regular: bool) -> Method | None:
-    """Blocks are eliminated without exchanges of rows between them, which is safe for small steps if the
-    mass matrix is regular."""
-    narrow = pattern.block_order.width <= _WIDEST * pattern.size
-    if narrow and regular:
-        return "blocks"
-    return "klu" if has_klu(dtype) else None
-
-
-def _is_regular(mass: Float[Array, "..."] | None) -> bool:
-    """Whether a mass matrix is known to be the identity or a diagonal without zeros."""
-    if mass is None:
-        return True
-    if isinstance(mass, jax.core.Tracer) or mass.ndim == 2:
-        return False
-    return bool(np.all(np.asarray(mass) != 0))
-
-
 _FOUND: dict[Any, SquarePattern | None] = {}
 _MOST_FOUND = 64
 
 
 def _found(
-    function: Callable, x: Float[Array, " n"], mass: Float[Array, "..."] | None
+    function: Callable,
+    x: Float[Array, " n"],
+    mass: Float[Array, "..."] | None,
+    massless: np.ndarray | None,
 ) -> SquarePattern | None:
     """Return the pattern, which is cached for each traced program."""
-    functions = [function]
+    has_mass = np.ones(x.size, bool) if massless is None else ~massless
+    functions = [function, lambda x: jnp.where(has_mass, x, 0)]
     if mass is not None and mass.ndim == 2:
-        functions.append(lambda x: mass @ x)
+        functions[1] = lambda x: mass @ x
     key = tuple(program_of(f, x) for f in functions)
     if key not in _FOUND:
         while len(_FOUND) >= _MOST_FOUND:

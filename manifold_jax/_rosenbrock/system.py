@@ -61,18 +61,18 @@ class System(NamedTuple):
         true_time = t * time_direction(self.terms)
         return mass_values(self.mass.mass, true_time, self._unravel(x), self.args)
 
-    def sparsity(
-        self, choice: Choice, x0: Vector, displacement: Vector | None
-    ) -> Sparsity | None:
+    def sparsity(self, choice: Choice, x0: Vector, displacement: Vector | None) -> Sparsity | None:
         """Return how the linear systems of the step are solved."""
         mass = self.mass_at(self.t0, x0)
+        massless = None if self.mass is None else self.mass.massless(x0.size)
         if displacement is None:
-            return choose_sparsity(choice, lambda x: self.increment(self.t0, x), x0, mass)
+            increment = lambda x: self.increment(self.t0, x)
+            return choose_sparsity(choice, increment, x0, mass, massless)
 
         def both(x: Vector) -> Vector:
             return self.increment(self.t0, x) + product(self.mass_at(self.t0, x), displacement)  # pyright: ignore[reportArgumentType]
 
-        return choose_sparsity(choice, both, x0, mass)
+        return choose_sparsity(choice, both, x0, mass, massless)
 
     def linearized(
         self, x0: Vector, displacement: Vector | None, sparsity: Sparsity | None = None

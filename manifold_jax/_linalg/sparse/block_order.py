@@ -28,9 +28,7 @@ class BlockOrder(NamedTuple):
         size: int = coupled.shape[0]  # pyright: ignore[reportOptionalSubscript]
         order = np.asarray(reverse_cuthill_mckee(coupled.tocsr(), symmetric_mode=True))
         given, reordered = _width(coupled, np.arange(size)), _width(coupled, np.argsort(order))
-        return BlockOrder(
-            size, *((None, given) if given <= reordered else (order, reordered))
-        )
+        return BlockOrder(size, *((None, given) if given <= reordered else (order, reordered)))
 
     @property
     def num_blocks(self) -> int:

@@ -13,24 +13,37 @@ from ..._base.types import BoolScalar
 from ..dense import Factorization
 from .elimination import Blocks, eliminate
 from .factorization import solve_in_blocks
-from .square import constant, identity, multiply_sparse, SparseMatrix, SquarePattern
+from .square import constant, multiply_sparse, permutation, SparseMatrix, SquarePattern
 
 
 Method: TypeAlias = Literal["blocks", "klu"]
 
 
 def factorize_sparse(A: SparseMatrix, method: Method) -> Factorization:
-    """Factor a matrix; one that is singular or not finite becomes the identity.
+    """Factor a matrix; one that is singular or not finite becomes another one.
 
     It is usable if a system with a known solution is solved to some digits.
     """
-    fixed = jax.lax.stop_gradient(A)
-    eye = identity(A.pattern, A.entries.dtype)
-    regular = jnp.all(jnp.isfinite(fixed.entries)) & ~fixed.has_empty_lines()
-    fixed = _where(regular, fixed, eye)
+    fixed, regular = jax.lax.stop_gradient(A), permutation(A.pattern, A.entries.dtype)
+    possible = jnp.all(jnp.isfinite(fixed.entries)) & ~fixed.has_empty_lines()
+    fixed = _where(possible, fixed, regular)
     factors = BlockElimination.of(fixed) if method == "blocks" else KLU.of(fixed)
-    usable = regular & _is_right(fixed, factors)
-    return Factorization(_where(usable, A, eye), factors, usable, multiply_sparse)
+    usable = possible & _is_right(fixed, factors)
+    A = _where(usable, A, regular)
+    return Factorization(A, Checked(factors, usable), usable, multiply_sparse)
+
+
+class Checked(eqx.Module):
+    """Factors where they are usable, else those of the identity."""
+
+    factors: Any
+    usable: BoolScalar
+
+    def solve(self, b: Float[Array, " n"]) -> Float[Array, " n"]:
+        return jnp.where(self.usable, self.factors.solve(b), b)
+
+    def solve_transposed(self, b: Float[Array, " n"]) -> Float[Array, " n"]:
+        return jnp.where(self.usable, self.factors.solve_transposed(b), b)
 
 
 def _where(condition: BoolScalar, A: SparseMatrix, B: SparseMatrix) -> SparseMatrix:
@@ -51,7 +64,13 @@ def _is_right(A: SparseMatrix, factors: Any) -> BoolScalar:
 
 class KLU(eqx.Module):
     """Elimination with exchanges of rows by SuiteSparse's KLU, once for every right-hand side: a handle
-    of factors could not be released inside of a compiled program."""
+    of factors could not be released inside of a compiled program.
+
+    KLU accepts pivots of a thousandth of the largest entry, and with entries that are zero it does so
+    often, so that the errors of long chains may grow beyond all limits. The known solution of
+    [`factorize_sparse`][] finds that, and transposed systems, which are another elimination, are
+    checked by their residual: NaN instead of a wrong solution.
+    """
 
     A: SparseMatrix
 
@@ -69,7 +88,11 @@ class KLU(eqx.Module):
 
     def solve_transposed(self, b: Float[Array, " n"]) -> Float[Array, " n"]:
         pattern = self.A.pattern
-        return klujax().solve(pattern.columns, pattern.rows, self.A.entries, b)
+        x = klujax().solve(pattern.columns, pattern.rows, self.A.entries, b)
+        error = jnp.max(jnp.abs(self.A.multiply_transposed(x) - b))
+        size = jnp.max(jnp.abs(self.A.entries)) * jnp.max(jnp.abs(x)) + jnp.max(jnp.abs(b))
+        tolerance = float(jnp.finfo(b.dtype).eps) ** (1 / 2)
+        return jnp.where(error <= tolerance * size, x, jnp.nan)
 
 
 class BlockElimination(eqx.Module):

@@ -71,7 +71,9 @@ class BlockFactorization(eqx.Module):
         `x . A x` of the solutions, `size2`. If so, the rank is full, no entry is missing, and `A` is
         not too ill conditioned for the elimination, or else `A x = b` nevertheless."""
         r = jax.lax.stop_gradient(residual)
-        change2 = jnp.abs(jnp.dot(r, solve_in_blocks(self.structure.block_order, self.eliminated, r)))
+        change2 = jnp.abs(
+            jnp.dot(r, solve_in_blocks(self.structure.block_order, self.eliminated, r))
+        )
         tolerance = float(jnp.finfo(r.dtype).eps) ** (1 / 3)
         return change2 <= tolerance**2 * jax.lax.stop_gradient(size2)
 
@@ -112,5 +114,7 @@ def _blocks(product: Any, structure: Structure, dtype: Any) -> Blocks:
     return Blocks(beside(-1), diagonal, beside(1))
 
 
-def solve_in_blocks(order: BlockOrder, eliminated: Any, b: Float[Array, " m"]) -> Float[Array, " m"]:
+def solve_in_blocks(
+    order: BlockOrder, eliminated: Any, b: Float[Array, " m"]
+) -> Float[Array, " m"]:
     return order.out_of_blocks(eliminated.solve(order.in_blocks(b)))

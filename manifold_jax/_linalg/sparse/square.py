@@ -9,22 +9,21 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Array, Bool, Float
+from scipy.sparse.csgraph import maximum_bipartite_matching
 
 from ..coloring import greedy_colors
 from .block_order import BlockOrder
 
 
 class SquarePattern:
-    """Where an `n x n` matrix has entries, its diagonal included: `rows` and `columns`, row by row."""
+    """Where an `n x n` matrix has entries: `rows` and `columns`, row by row."""
 
     def __init__(self, entries: sp.csr_matrix):
-        size: int = entries.shape[0]  # pyright: ignore[reportOptionalSubscript]
-        filled = sp.csr_matrix(entries.astype(np.int64) + sp.identity(size, dtype=np.int64))
-        filled.sum_duplicates()
-        filled.sort_indices()
-        self.size = size
-        self.rows = np.repeat(np.arange(size, dtype=np.int32), np.diff(filled.indptr))
-        self.columns = filled.indices.astype(np.int32)
+        entries = sp.csr_matrix(entries)
+        entries.sort_indices()
+        self.size: int = entries.shape[0]  # pyright: ignore[reportOptionalSubscript]
+        self.rows = np.repeat(np.arange(self.size, dtype=np.int32), np.diff(entries.indptr))
+        self.columns = entries.indices.astype(np.int32)
 
     @property
     def num_entries(self) -> int:
@@ -32,8 +31,17 @@ class SquarePattern:
 
     @functools.cached_property
     def on_diagonal(self) -> np.ndarray:
-        """Return the numbers of the entries on the diagonal, row by row."""
+        """Return the numbers of those entries that are on the diagonal."""
         return np.flatnonzero(self.rows == self.columns).astype(np.int32)
+
+    @functools.cached_property
+    def transversal(self) -> np.ndarray | None:
+        """Return the numbers of entries of which one is in each row and each column; `None` if there
+        are none: then all matrices of the pattern are singular."""
+        column_of = maximum_bipartite_matching(self._matrix(), perm_type="column")
+        if (column_of < 0).any():
+            return None
+        return np.flatnonzero(column_of[self.rows] == self.columns).astype(np.int32)
 
     @functools.cached_property
     def color(self) -> np.ndarray:
@@ -87,12 +95,16 @@ class SparseMatrix(eqx.Module):
 
     @staticmethod
     def of_mass(mass: Float[Array, "..."], pattern: SquarePattern) -> "SparseMatrix":
-        """Return a scalar, a diagonal or a matrix in the form of the pattern."""
+        """Return a scalar, a diagonal or a matrix in the form of the pattern. Not finite if it has other
+        entries."""
         if mass.ndim == 2:
             return SparseMatrix(mass[constant(pattern.rows), constant(pattern.columns)], pattern)
         diagonal = jnp.broadcast_to(mass, (pattern.size,))
-        entries = jnp.zeros(pattern.num_entries, mass.dtype)
-        return SparseMatrix(entries.at[constant(pattern.on_diagonal)].set(diagonal), pattern)
+        numbers, entries = pattern.on_diagonal, jnp.zeros(pattern.num_entries, mass.dtype)
+        entries = entries.at[constant(numbers)].set(diagonal[constant(pattern.rows[numbers])])
+        others = np.setdiff1d(np.arange(pattern.size), pattern.rows[numbers])
+        outside = jnp.any(diagonal[others] != 0)
+        return SparseMatrix(entries + jnp.where(outside, jnp.nan, 0).astype(mass.dtype), pattern)
 
     def multiply(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
         return self.over_rows(jax.ops.segment_sum, self.entries * x[constant(self.pattern.columns)])
@@ -105,7 +117,7 @@ class SparseMatrix(eqx.Module):
     def scaled_rows(self, factors: Float[Array, " n"]) -> "SparseMatrix":
         return SparseMatrix(self.entries * factors[constant(self.pattern.rows)], self.pattern)
 
-    def over_rows(self, reduction: Callable, values: Array) -> Float[Array, " n"]:
+    def over_rows(self, reduction: Callable, values: Array) -> Array:
         """Reduce values, one per entry, over each row; `reduction` is such as `jax.ops.segment_max`."""
         return reduction(
             values, constant(self.pattern.rows), self.pattern.size, indices_are_sorted=True
@@ -132,8 +144,10 @@ def multiply_sparse(A: SparseMatrix, x: Float[Array, " n"]) -> Float[Array, " n"
     return A.multiply(x)
 
 
-def identity(pattern: SquarePattern, dtype: jnp.dtype) -> SparseMatrix:
-    return SparseMatrix.of_mass(jnp.ones((), dtype), pattern)
+def permutation(pattern: SquarePattern, dtype: jnp.dtype) -> SparseMatrix:
+    """Return a matrix of the pattern with a one in each row and each column."""
+    entries = jnp.zeros(pattern.num_entries, dtype)
+    return SparseMatrix(entries.at[constant(pattern.transversal)].set(1), pattern)  # pyright: ignore[reportArgumentType]
 
 
 def constant(indices: np.ndarray) -> Array:

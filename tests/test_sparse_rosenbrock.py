@@ -1,0 +1,251 @@
+"""Rosenbrock methods whose linear systems are solved with sparse matrices."""
+
+import subprocess
+import sys
+
+import diffrax as dfx
+import jax
+import jax.flatten_util
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.sparse as sp
+
+import manifold_jax as mj
+from manifold_jax._base.klu import has_klu
+from manifold_jax._jaxpr.trace import num_equations
+from manifold_jax._linalg.sparse import factorize_sparse, SparseMatrix, SquarePattern
+from manifold_jax._rosenbrock import sparsity
+from manifold_jax._rosenbrock.algebraic import consistent
+
+
+needs_klu = pytest.mark.skipif(not has_klu(jnp.float64), reason="klujax is not installed")
+METHODS = ["blocks", pytest.param("klu", marks=needs_klu)]
+
+
+def banded(n: int, seed: int = 0) -> sp.csr_matrix:
+    """A matrix with two diagonals beside the main one, in a random order."""
+    random = np.random.default_rng(seed)
+    A = sp.diags([random.normal(size=n - k) for k in (2, 1)], [-2, 1], shape=(n, n))
+    A = sp.csr_matrix(A + sp.diags(3 + random.uniform(size=n)))
+    order = random.permutation(n)
+    return sp.csr_matrix(A[order][:, order])
+
+
+def from_scipy(A: sp.csr_matrix) -> SparseMatrix:
+    pattern = SquarePattern(sp.csr_matrix(A != 0))
+    return SparseMatrix(jnp.asarray(A.toarray()[pattern.rows, pattern.columns]), pattern)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_systems_and_their_derivatives(method):
+    A, b = banded(50), jnp.asarray(np.random.default_rng(1).normal(size=50))
+    sparse, direction = from_scipy(A), from_scipy(banded(50, 2) * (A != 0))
+    direction = SparseMatrix(jnp.cos(jnp.arange(sparse.entries.size)), sparse.pattern)
+    dA = np.zeros((50, 50))
+    dA[sparse.pattern.rows, sparse.pattern.columns] = direction.entries
+
+    def solve(entries, b):
+        return factorize_sparse(SparseMatrix(entries, sparse.pattern), method).solve(b)
+
+    x = np.linalg.solve(A.toarray(), b)
+    np.testing.assert_allclose(jax.jit(solve)(sparse.entries, b), x, rtol=1e-12, atol=1e-13)
+    first = -np.linalg.solve(A.toarray(), dA @ x)
+    second = -2 * np.linalg.solve(A.toarray(), dA @ first)
+    along = lambda s: solve(sparse.entries + s * direction.entries, b)
+    tangent = lambda s: jax.jvp(along, (s,), (1.0,))[1]
+    np.testing.assert_allclose(tangent(0.0), first, rtol=1e-11, atol=1e-12)
+    _, found = jax.jvp(tangent, (0.0,), (1.0,))
+    np.testing.assert_allclose(found, second, rtol=1e-10, atol=1e-11)
+    weights = jnp.sin(jnp.arange(50.0))
+    by_entries, by_b = jax.vjp(solve, sparse.entries, b)[1](weights)
+    adjoint = np.linalg.solve(A.toarray().T, weights)
+    np.testing.assert_allclose(by_b, adjoint, rtol=1e-12, atol=1e-13)
+    expected = -adjoint[sparse.pattern.rows] * x[sparse.pattern.columns]
+    np.testing.assert_allclose(by_entries, expected, rtol=1e-11, atol=1e-12)
+    batch = jax.vmap(solve)(jnp.stack([sparse.entries, 2 * sparse.entries]), jnp.stack([b, b]))
+    np.testing.assert_allclose(batch, np.stack([x, x / 2]), rtol=1e-12, atol=1e-13)
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("fault", ["equal rows", "zero row", "zero column", "nan"])
+def test_singular_matrices_are_not_usable(method, fault):
+    A = banded(50)
+    pair = sp.csr_matrix(([True, True], ([3, 7], [7, 3])), A.shape)
+    pattern = SquarePattern(sp.csr_matrix((A != 0) + pair))
+    A = A.toarray()
+    if fault == "equal rows":
+        A[3] = A[7] = 0
+        A[[3, 3, 7, 7], [3, 7, 3, 7]] = 1.0
+    elif fault == "zero row":
+        A[3] = 0
+    elif fault == "zero column":
+        A[:, 3] = 0
+    else:
+        A[3, 3] = np.nan
+    entries = jnp.asarray(A[pattern.rows, pattern.columns])
+    factor = factorize_sparse(SparseMatrix(entries, pattern), method)
+    assert not factor.usable
+    assert jnp.all(jnp.isfinite(factor.solve(jnp.ones(50))))
+
+
+def filters(n, shift=0):
+    """Low-pass filters in a row: voltages `v` of capacitors, and `e` of the nodes between two resistors
+    and a diode. With a `shift` no algebraic equation is in the place of its unknown."""
+
+    def ladder(t, y, args):
+        frequency, resistance, capacitance = args
+        v, e = y["v"], jnp.roll(y["e"], shift)
+        left = jnp.concatenate([jnp.sin(frequency * t)[None], v[:-1]])
+        right = jnp.concatenate([e[1:], v[-1:]])
+        node = (left - e) / resistance - (e - v) - 1e-3 * (jnp.exp(e) - 1)
+        return {"v": ((e - v) - (v - right) / resistance) / capacitance, "e": node}
+
+    mass = {"v": np.ones(n), "e": np.zeros(n)}
+    return mj.MassMatrixTerm(ladder, mass), {"v": jnp.zeros(n), "e": jnp.zeros(n)}
+
+
+ARGS = jnp.asarray([1.0, 0.7, 0.5])
+
+
+def end(structure, system, args, t1=0.3, **options):
+    term, y0 = system
+    sol = mj.diffeqsolve(
+        term,
+        mj.Rodas5P(structure=structure),
+        0.0,
+        t1,
+        1e-3,
+        y0,
+        args,
+        stepsize_controller=dfx.PIDController(rtol=1e-6, atol=1e-8),
+        max_steps=256,
+        consistent="project",
+        **options,
+    )
+    return sum(jnp.sum(leaf[-1] ** 2) for leaf in jax.tree.leaves(sol.ys)), sol
+
+
+def methods_found(monkeypatch):
+    """Record which methods are chosen."""
+    chosen = []
+    choose = sparsity.choose_sparsity
+
+    def recording(*args):
+        chosen.append(found := choose(*args))
+        return found
+
+    for module in ("system", "algebraic"):
+        monkeypatch.setattr(f"manifold_jax._rosenbrock.{module}.choose_sparsity", recording)
+    return lambda: {None if found is None else found.method for found in chosen}
+
+
+def test_solutions_and_gradients_as_dense(monkeypatch):
+    methods = methods_found(monkeypatch)
+    program = jax.value_and_grad(end, argnums=2, has_aux=True)
+    run = lambda structure: jax.jit(lambda args: program(structure, filters(30), args))(ARGS)
+    (_, sparse), by_sparse = run("auto")
+    assert methods() == {"blocks"}
+    (_, dense), by_dense = run("dense")
+    assert sparse.stats["num_steps"] == dense.stats["num_steps"] >= 5
+    for name in ("v", "e"):
+        np.testing.assert_allclose(sparse.ys[name], dense.ys[name], rtol=1e-10, atol=1e-14)
+    np.testing.assert_allclose(by_sparse, by_dense, rtol=1e-10)
+
+
+@needs_klu
+@pytest.mark.slow
+def test_a_batch_with_exchanges_of_rows(monkeypatch):
+    """Trajectories of a batch end at different times: those that have finished make steps of length
+    zero, whose matrices are singular."""
+    methods = methods_found(monkeypatch)
+    ends, factors = jnp.asarray([0.1, 0.3]), jnp.asarray([1.0, 1.5])
+
+    def along(structure, factor, t1):
+        run = lambda factor: end(structure, filters(30, shift=1), factor * ARGS, t1)[0]
+        return jax.value_and_grad(run)(factor)
+
+    batch = jax.jit(jax.vmap(lambda f, t1: along("auto", f, t1)))(factors, ends)
+    assert methods() == {"klu"}
+    one = jax.jit(lambda f, t1: along("dense", f, t1))
+    for k in range(2):
+        for found, expected in zip(batch, one(factors[k], ends[k]), strict=True):
+            np.testing.assert_allclose(found[k], expected, rtol=1e-10)
+
+
+def test_consistent_starts_as_dense():
+    term, y0 = filters(30)
+    guess = {"v": jnp.cos(jnp.arange(30.0)), "e": y0["e"]}
+    sparse, info = term.consistent_state(0.2, guess, ARGS)
+    x, unravel = jax.flatten_util.ravel_pytree(guess)
+    dense, _ = consistent(term.equations(guess, ARGS), 0.2, x)
+    assert info.success
+    assert info.residual < 1e-15
+    np.testing.assert_array_equal(sparse["v"], guess["v"])
+    np.testing.assert_allclose(sparse["e"], unravel(dense)["e"], rtol=1e-13)
+    index_2 = mj.MassMatrixTerm(lambda t, y, args: {"v": y["e"], "e": y["v"]}, term.mass)
+    with pytest.raises(RuntimeError, match="index of M y' = f is above 1"):
+        index_2.consistent_state(0.2, guess, ARGS)
+
+
+def test_the_program_does_not_grow_with_the_system():
+    def size(n):
+        term, y0 = filters(n)
+        solve = lambda args: end("sparse", (term, y0), args)[0]
+        return num_equations(jax.jit(solve), ARGS)
+
+    assert size(1000) < 1.3 * size(100)
+
+
+def wide(x):
+    """Each equation with five random unknowns."""
+    return jnp.sum(x[np.random.default_rng(0).integers(60, size=(5, 60))], axis=0)
+
+
+@pytest.mark.parametrize(
+    ("name", "function", "mass", "klu", "expected"),
+    [
+        ("few unknowns", lambda x: jnp.roll(x[:10], 1), None, True, None),
+        ("neighbours", lambda x: jnp.diff(x, append=0.0), None, False, "blocks"),
+        ("no own unknown", lambda x: jnp.roll(x, 1), np.zeros(60), False, None),
+        ("no own unknown", lambda x: jnp.roll(x, 1), np.zeros(60), True, "klu"),
+        ("own unknown", lambda x: x + jnp.append(x[1:], 0.0), np.zeros(60), True, "blocks"),
+        ("wide", wide, None, False, None),
+        ("wide", wide, None, True, "klu"),
+        ("a matrix", lambda x: x, np.eye(60), True, None),
+        ("everything", lambda x: x * jnp.sum(x), None, True, None),
+    ],
+)
+def test_choice(monkeypatch, name, function, mass, klu, expected):
+    monkeypatch.setattr(sparsity, "has_klu", lambda dtype: klu)
+    x = jnp.ones(10 if name == "few unknowns" else 60)
+    massless = None if mass is None else np.asarray(mass) == 0
+    mass = None if mass is None else jnp.asarray(mass)
+    found = sparsity.choose_sparsity("auto", function, x, mass, massless)
+    assert (None if found is None else found.method) == expected
+
+
+def test_refusals(monkeypatch):
+    monkeypatch.setattr(sparsity, "has_klu", lambda dtype: False)
+    with pytest.raises(ValueError, match="`structure` must be 'auto', 'dense' or 'sparse'"):
+        sparsity.check_structure("band")
+    x = jnp.ones(60)
+    with pytest.raises(ValueError, match="most of the 60 equations of `terms` depend on most"):
+        sparsity.choose_sparsity("sparse", lambda x: x * jnp.sum(x), x, None)
+    with pytest.raises(ValueError, match="structurally singular: however the unknowns"):
+        sparsity.choose_sparsity("sparse", lambda x: x.at[0].set(x[1]), x, x, np.ones(60, bool))
+    with pytest.raises(ValueError, match=r"Install klujax .*manifold_jax\[sparse\]"):
+        sparsity.choose_sparsity("sparse", wide, x, None)
+
+
+@needs_klu
+def test_klujax_does_not_change_settings():
+    program = """
+import jax
+from manifold_jax._base.klu import klujax
+klujax()
+import jax.numpy as jnp
+assert jnp.ones(()).dtype == jnp.float32
+assert not jax.config.values["jax_platform_name"]
+"""
+    subprocess.run([sys.executable, "-c", program], check=True)
