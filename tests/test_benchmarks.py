@@ -59,6 +59,7 @@ TOO_LONG = {
     "benchmarks.speed.gradients",
     "benchmarks.speed.overhead",
     "benchmarks.speed.scaling",
+    "benchmarks.speed.sparse_stiff",
     "benchmarks.speed.thresholds",
     "benchmarks.sympy_models.__main__",  # its parts are in test_sympy.py
 }

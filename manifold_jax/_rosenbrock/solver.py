@@ -178,8 +178,8 @@ class Rodas5P(AbstractRosenbrock):
     [`MassMatrixTerm`][]), and `RESULTS.nonfinite` where `f` is not finite at an accepted state.
 
     Source: Steinebach, BIT Numer. Math. 63:27 (2023); coefficients as published there, dense output
-    included. Hairer & Wanner, Solving ODEs II, IV.7 and VI.4 (methods and their implementation); Curtis, Powell & Reid, J. Inst. Maths Applics
-    13 (1974) 117-119 (colors).
+    included. Hairer & Wanner, Solving ODEs II, IV.7 and VI.4 (methods and their implementation); Curtis,
+    Powell & Reid, J. Inst. Maths Applics 13 (1974) 117-119 (colors).
     """
 
     tableau: ClassVar[RosenbrockTableau] = RODAS5P
