@@ -197,6 +197,16 @@ def test_the_program_does_not_grow_with_the_system():
     assert size(1000) < 1.3 * size(100)
 
 
+def test_masses_that_are_not_known():
+    """A mass that is an input of the program may be zero: without an unknown of its own for each
+    equation the systems are then dense, and otherwise sparse."""
+    x, mass = jnp.ones(60), jnp.ones(60)
+    shifted = sparsity.choose_sparsity("auto", lambda x: jnp.roll(x, 1), x, mass)
+    assert shifted is None
+    own = sparsity.choose_sparsity("auto", lambda x: x - jnp.append(x[1:], 0.0), x, mass)
+    assert own.method == "blocks"
+
+
 def wide(x):
     """Each equation with five random unknowns."""
     return jnp.sum(x[np.random.default_rng(0).integers(60, size=(5, 60))], axis=0)

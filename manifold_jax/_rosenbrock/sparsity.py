@@ -59,6 +59,15 @@ def choose_sparsity(
         if choice == "sparse":
             raise ValueError(_SINGULAR)
         return None
+    if (
+        choice == "auto"
+        and mass is not None
+        and massless is None
+        and not _has_diagonal(function, x)
+    ):
+        return (
+            None  # entries that may be zero or not: dense exchanges of rows do not depend on that
+        )
     with_klu = has_klu(x.dtype)
     narrow = pattern.block_order.width <= _WIDEST * n
     is_regular = mass is None or (massless is not None and not massless.any())
@@ -110,6 +119,12 @@ def _found(
             _FOUND.pop(next(iter(_FOUND)))
         _FOUND[key] = _pattern(functions, x)
     return _FOUND[key]
+
+
+def _has_diagonal(function: Callable, x: Float[Array, " n"]) -> bool:
+    """Whether each equation depends on an unknown of its own, whatever the mass."""
+    pattern = _found(function, x, None, np.ones(x.size, bool))
+    return pattern is not None and len(pattern.on_diagonal) == x.size
 
 
 def _pattern(functions: list[Callable], x: Float[Array, " n"]) -> SquarePattern | None:
