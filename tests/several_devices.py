@@ -139,7 +139,7 @@ def test_solves_in_mapped_functions(devices, name):
         return jnp.sum(sol.ys[:, 0])
 
     start, rates, both = STARTS[0], RATES[:2], jax.value_and_grad(end)
-    single = [both(rate) for rate in rates]
+    single = [*map(jax.jit(both), rates)]
     spec = PartitionSpec("x")
     sharded = jax.shard_map(
         jax.vmap(both), mesh=Mesh(devices, ("x",)), in_specs=spec, out_specs=spec, check_vma=False

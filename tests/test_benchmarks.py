@@ -33,7 +33,7 @@ SMALLEST = {
     "benchmarks.peers.impacts": dict(repeats=1, quick=True),
     "benchmarks.peers.long_times": dict(evaluations=16_000, quick=True),
     "benchmarks.peers.mujoco_peers": dict(),
-    "benchmarks.peers.pendulum_peers": dict(repeats=1),
+    "benchmarks.peers.pendulum_peers": dict(repeats=1, quick=True),
     "benchmarks.peers.polymer": dict(bonds=6, long=1.0, repeats=1, quick=True),
     "benchmarks.sbml_events.__main__": dict(numbers="00929"),
     "benchmarks.speed.accelerator": dict(

@@ -69,14 +69,14 @@ def test_stiff_governor():
     assembly = governor()
     names = ("shaft", "slider", "right", "left")
     y0 = assembly.state(angular_velocities=dict.fromkeys(names, (0, 0, RATE)), assemble=True)
-    ts = np.linspace(0, 2, 81)
+    ts = np.linspace(0, 1, 41)
     options = dict(method="Radau", rtol=1e-11, atol=1e-11, t_eval=ts)
-    expected = solve_ivp(reduced, (0, 2), [ANGLE, HEIGHT, RATE, 0, 0], **options).y[1]
+    expected = solve_ivp(reduced, (0, 1), [ANGLE, HEIGHT, RATE, 0, 0], **options).y[1]
     sol = mj.diffeqsolve(
         assembly.system.terms,
         mj.Projected(mj.Rodas5P(), assembly.system.constraint),
         0.0,
-        2.0,
+        1.0,
         None,
         y0,
         saveat=dfx.SaveAt(ts=ts),
@@ -89,4 +89,4 @@ def test_stiff_governor():
         lambda t, q, v: mj.constraint_violation(assembly.system.constraint, t, (q, v), None)
     )
     assert violation(ts, q, v).max() < 1e-14
-    assert sol.stats["num_steps"] < 2000
+    assert sol.stats["num_steps"] < 1000

@@ -223,13 +223,16 @@ def test_gradients_and_batches(solver):
     if isinstance(solver, dfx.Kvaerno3):
         finder = dfx.VeryChord(rtol=1e-9, atol=1e-9)
         solver = dfx.Kvaerno3(root_finder=finder)
-    run = jax.jit(lambda s: end_of_turn(s, mj.StepReplayAdjoint(), solver))
-    reverse = jax.jit(jax.grad(run))(1.3)
-    forward = jax.jvp(lambda s: end_of_turn(s, dfx.ForwardMode(), solver), (1.3,), (1.0,))[1]
-    np.testing.assert_allclose(reverse, forward, rtol=1e-10)
-    np.testing.assert_allclose(reverse, (run(1.3 + 1e-5) - run(1.3 - 1e-5)) / 2e-5, rtol=1e-7)
-    batch = jax.jit(jax.vmap(run))(jnp.array([1.3, 0.4]))
-    np.testing.assert_allclose(batch, [run(1.3), run(0.4)], rtol=1e-12)
+    run = jax.jit(jax.value_and_grad(lambda s: end_of_turn(s, mj.StepReplayAdjoint(), solver)))
+    values, reverse = zip(run(1.3), run(0.4))
+    difference = (run(1.3 + 1e-5)[0] - run(1.3 - 1e-5)[0]) / 2e-5
+    np.testing.assert_allclose(reverse[0], difference, rtol=1e-7)
+    forward = lambda s: jax.jvp(
+        lambda s: end_of_turn(s, dfx.ForwardMode(), solver), (s,), (jnp.ones(()),)
+    )
+    batch, slopes = jax.jit(jax.vmap(forward))(jnp.array([1.3, 0.4]))
+    np.testing.assert_allclose(batch, values, rtol=1e-12)
+    np.testing.assert_allclose(slopes, reverse, rtol=1e-10)
 
 
 def test_a_step_of_more_than_half_a_turn_is_rejected():

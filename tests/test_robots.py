@@ -87,7 +87,6 @@ def test_bodies_joints_and_frames_have_the_names_of_the_file(robot):
     assert sum(gap.size for gap in robot.assembly.gaps(robot.assembly.state()[0]).values()) == 23
 
 
-@eqx.filter_jit
 def end_of_swing(assembly, torques):
     """The tip after 0.2 s; all numbers of the file are leaves of the assembly."""
     system, start = assembly.system, assembly.state(assemble=True)
@@ -114,13 +113,14 @@ def damping(assembly):
 def test_gradients_by_numbers_of_the_file(robot):
     """By a mass, a damping and a length: reverse mode and differences."""
     torques = jnp.asarray(TORQUES)
-    by_file = eqx.filter_jit(eqx.filter_grad(end_of_swing))(robot.assembly, torques)
+    both = eqx.filter_jit(eqx.filter_value_and_grad(end_of_swing))  # one program for all
+    _, by_file = both(robot.assembly, torques)
     places = ((mass, (1,)), (damping, (0,)), (hinge_point, (1, 1, 2)))
     for leaf, place in places:
         shifted = lambda h, leaf=leaf, place=place: eqx.tree_at(
             leaf, robot.assembly, leaf(robot.assembly).at[place].add(h)
         )
-        f = lambda h, shifted=shifted: float(end_of_swing(shifted(h), torques))
+        f = lambda h, shifted=shifted: float(both(shifted(h), torques)[0])
         h = 1e-4
         difference = (8 * (f(h) - f(-h)) - f(2 * h) + f(-2 * h)) / (12 * h)
         gradient = float(leaf(by_file)[place])

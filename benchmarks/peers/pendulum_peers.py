@@ -485,6 +485,7 @@ def main(
     json: Annotated[Path | None, typer.Option(metavar="FILE", help="Write results here.")] = None,
     plot: Annotated[Path | None, typer.Option(metavar="FILE", help="Draw a picture.")] = None,
     repeats: Annotated[int, typer.Option(min=1, help="Timed runs of every method.")] = 21,
+    quick: Annotated[bool, typer.Option(help="One tolerance alone.")] = False,
 ) -> None:
     """Compare ways to solve the pendulum: error, violation and time at three tolerances."""
     use_double_precision()
@@ -494,7 +495,7 @@ def main(
         console.print(f"{PEERS[module]} is not installed (extra `peers`): left out")
     methods = [method for method in METHODS if method.module not in missing]
     rows: list[Row] = []
-    for tolerance in TOLERANCES:
+    for tolerance in TOLERANCES[:1] if quick else TOLERANCES:
         with console.status(f"tolerance {tolerance:.0e}"):
             rows += compare(methods, tolerance, repeats)
     console.print(result_table(rows))
