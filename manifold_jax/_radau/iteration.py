@@ -1,0 +1,92 @@
+"""Simplified Newton iterations for the stages, and when they end."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+
+from .._base.compat import use_stepsize_tol
+from .._base.types import BoolScalar, FloatScalar, IntScalar, Y
+from .stages import SimplifiedNewton, StageEquations, Stages
+
+
+# Iterations to round-off converge by a factor of 30 or more each in most steps.
+_MOST = 10
+
+# The error of stages that count as solved, in units of the tolerance.
+_KAPPA = 1e-2
+
+
+class StageTolerances(eqx.Module):
+    """The tolerances in which the error of stages is measured: those of the step size controller, which
+    Diffrax (with constant steps [`mj.diffeqsolve`][]) puts in."""
+
+    rtol: Any = use_stepsize_tol
+    atol: Any = use_stepsize_tol
+    norm: Any = use_stepsize_tol
+
+    def size(self, change: Y, y: Y) -> FloatScalar:
+        """Return the size of a change of the state `y`."""
+        scaled = lambda dx, x: dx / (self.atol + self.rtol * jnp.abs(x))
+        with jax.numpy_dtype_promotion("standard"):
+            return jnp.asarray(self.norm(jtu.tree_map(scaled, change, y)))
+
+
+class Iterate(NamedTuple):
+    """`size` and `previous` are those of the last two changes, in units of the tolerance."""
+
+    Z: Stages
+    size: FloatScalar
+    previous: FloatScalar
+    iterations: IntScalar
+    status: IntScalar
+
+
+_GOES_ON, _SOLVED, _FAILED = 0, 1, 2
+
+
+def solve_stages(
+    equations: StageEquations,
+    newton: SimplifiedNewton,
+    guess: Stages,
+    size: Callable[[Stages], FloatScalar],
+    rounding: FloatScalar,
+) -> tuple[Stages, BoolScalar]:
+    r"""Iterate to round-off, without derivatives: to changes of `size` `rounding`, or to changes below
+    `_KAPPA` that no longer shrink.
+
+    Where iterations end before, stages are solved if their error, estimated from the rate $\theta$ as
+    $|\Delta Z| \theta / (1 - \theta)$, is below `_KAPPA`.
+    """
+
+    def advance(i: Iterate) -> Iterate:
+        change = newton.step(equations.residual(i.Z))
+        new = size(change)
+        return Iterate(
+            i.Z + change, new, i.size, i.iterations + 1, _status(new, i, rounding, _KAPPA)
+        )
+
+    zero = jnp.zeros((), rounding.dtype)
+    first = Iterate(guess, zero, zero, jnp.asarray(0), jnp.asarray(_GOES_ON))
+    end = jax.lax.while_loop(lambda i: i.status == _GOES_ON, advance, first)
+    return end.Z, end.status == _SOLVED
+
+
+def _status(new: FloatScalar, i: Iterate, rounding: FloatScalar, kappa: float) -> IntScalar:
+    """Return the status after a change of the size `new`.
+
+    Source: Hairer & Wanner, Solving ODEs II, IV.8 (8.10, 8.11).
+    """
+    twice = i.iterations >= 1
+    rate = jnp.where(twice, new / jnp.where(twice, i.size, 1), 0)
+    near = new < kappa
+    error = new * rate / (1 - rate)
+    finished = (new <= rounding) | twice & near & (rate > 0.3)
+    last = i.iterations + 1 >= _MOST
+    accurate = near | (rate < 1) & (error < kappa)
+    failed = ~jnp.isfinite(new) | twice & (rate > 2) & ~near | last & ~accurate
+    done = jnp.where(finished | last, _SOLVED, _GOES_ON)
+    return jnp.where(failed & ~finished, _FAILED, done)

@@ -1,0 +1,161 @@
+"""The Radau IIA method of order 5 as a Diffrax solver."""
+
+from collections.abc import Callable
+from typing import Any, ClassVar, NamedTuple
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.flatten_util as jfu
+import jax.numpy as jnp
+from diffrax import RESULTS
+
+from .._base.closure import convert_closure
+from .._base.compat import is_okay, nonlinear_failure
+from .._base.rejection import is_repeatable, rejecting
+from .._base.types import Args, BoolScalar, FloatScalar, RealScalarLike, Y
+from .._linalg.newton import root_of_step, without_derivative
+from .._linalg.rows import product
+from .._rosenbrock.mass_matrix_solver import AbstractMassMatrixSolver
+from .._rosenbrock.solver import RosenbrockInterpolation
+from .._rosenbrock.system import System, Vector
+from .iteration import solve_stages, StageTolerances
+from .stages import constant, extrapolated, SimplifiedNewton, StageEquations, Stages
+from .tableau import A_INVERSE, DENSE, ERROR
+
+
+# The longest step, in units of the one before, into which its polynomial is continued.
+_FARTHEST = 8.0
+
+
+class RadauState(eqx.Module):
+    """Carried from step to step.
+
+    - `first_step`: the size of the first step that was tried (the scale of time near t = 0).
+    - `derivative`: `y'`, if the mass matrix depends on time or state.
+    - `usable`: whether the start is consistent.
+    - `increments`, `length`: the stages of the step before and its length, zero before the first one.
+    """
+
+    first_step: FloatScalar
+    derivative: Vector | None
+    usable: BoolScalar
+    increments: Stages
+    length: FloatScalar
+
+
+class _Step(NamedTuple):
+    """The stages, the error estimate, and whether the equations are defined and the stages solved."""
+
+    Z: Stages
+    error: Vector
+    defined: BoolScalar
+    solved: BoolScalar
+
+
+class RadauIIA5(AbstractMassMatrixSolver, dfx.AbstractImplicitSolver):
+    """Radau."""
+
+    checks_start: bool = True  # false if the state has been made consistent before
+    root_finder: StageTolerances = StageTolerances()  # pyright: ignore
+    root_find_max_steps: int = eqx.field(default=10, static=True)
+
+    term_structure: ClassVar = dfx.AbstractTerm
+    interpolation_cls: ClassVar[Callable[..., RosenbrockInterpolation]] = RosenbrockInterpolation
+
+    def order(self, terms: Any) -> int:
+        return 5
+
+    def error_order(self, terms: Any) -> int:
+        return 4  # that of the error estimate of one step
+
+    def func(self, terms: Any, t0: RealScalarLike, y0: Y, args: Args) -> Any:
+        return terms.vf(t0, y0, args)
+
+    def init(
+        self, terms: Any, t0: RealScalarLike, t1: RealScalarLike, y0: Y, args: Args
+    ) -> RadauState:
+        derivative, usable = self.derivative_at_start(System.of(terms, t0, t1, y0, args), y0)
+        x, _ = jfu.ravel_pytree(y0)
+        length = jnp.abs(jnp.asarray(t1) - t0)
+        none = jnp.zeros((3, x.size), x.dtype)
+        return RadauState(length, derivative, usable, none, jnp.zeros_like(length))
+
+    def step(
+        self,
+        terms: Any,
+        t0: RealScalarLike,
+        t1: RealScalarLike,
+        y0: Y,
+        args: Args,
+        solver_state: RadauState,
+        made_jump: Any,
+    ) -> tuple[Y, Y | None, dict[str, Any], RadauState, RESULTS]:
+        system = System.of(terms, t0, t1, y0, args)
+        x0, unravel = jfu.ravel_pytree(y0)
+        state = without_derivative(solver_state)
+        fixed = StageEquations(*without_derivative((system, x0)))
+        derivative = fixed.system.refreshed(made_jump, state.derivative, fixed.x0)
+        step = self._solve(fixed, state, derivative)
+        newton_step = StageEquations(system, x0).newton_step
+        Z = root_of_step(convert_closure(newton_step, step.Z), step.Z)
+        ok = jnp.all(jnp.isfinite(step.error)) & jnp.all(jnp.isfinite(step.Z))
+        result = RESULTS.where(ok, RESULTS.successful, RESULTS.nonfinite)  # pyright: ignore[reportArgumentType]
+        failed = step.defined & ~step.solved | ~state.usable
+        result = RESULTS.where(failed, nonlinear_failure(), result)
+        # A smaller step does not help if the equations are not defined at its beginning.
+        repeatable = is_repeatable(t0, t1, state.first_step) & step.defined & state.usable
+        y1 = unravel(x0 + Z[2] + jnp.where(state.usable, 0.0, jnp.nan).astype(x0.dtype))
+        error = rejecting(unravel(step.error), is_okay(result), repeatable)
+        k1, k2 = constant(DENSE, Z) @ Z
+        dense_info = dict(y0=y0, y1=y1, k=(unravel(k1), unravel(k2)))
+        return y1, error, dense_info, self._after(system, state, step.Z), result
+
+    def _solve(
+        self, equations: StageEquations, state: RadauState, derivative: Vector | None
+    ) -> _Step:
+        """Return the stages and the error estimate, without derivatives."""
+        x0, h = equations.x0, equations.system.step
+        V0 = jnp.zeros_like(x0) if derivative is None else h.astype(x0.dtype) * derivative
+        newton = equations.at_start(V0)
+        unravel = jfu.ravel_pytree(equations.system.y0)[1]
+        y0, tolerances = unravel(x0), self.root_finder
+        size = lambda dx: tolerances.size(unravel(dx), y0)
+        unit = 8 * jnp.finfo(x0.dtype).eps
+        Z, solved = solve_stages(
+            equations,
+            newton,
+            _guess(state, h),
+            lambda dZ: jnp.max(jax.vmap(size)(dZ)),
+            size(unit * x0),
+        )
+        combination = constant(ERROR, Z) @ Z
+        error = newton.filtered(newton.f0, combination)
+
+        def again() -> Vector:
+            """Filter the estimate once more, where it is too large because of stiff components."""
+            t0 = jnp.asarray(equations.system.t0)
+            f = equations.rest(t0, x0 + error, V0) + product(newton.M, V0)
+            return newton.filtered(f, combination)
+
+        error = jnp.where(size(error) < 1, error, again())
+        solved &= newton.nonsingular
+        Z = jnp.where(solved, Z, 0)
+        return _Step(Z, error, newton.defined, solved)
+
+    def _after(self, system: System, state: RadauState, Z: Stages) -> RadauState:
+        h = system.step
+        derivative = state.derivative
+        if derivative is not None:
+            # A lane of a batch that has finished makes steps of length zero.
+            width = jnp.where(h == 0, 1, h).astype(Z.dtype)
+            derivative = constant(A_INVERSE[2], Z) @ Z / width
+        return RadauState(state.first_step, derivative, state.usable, Z, jnp.abs(h))
+
+
+def _guess(state: RadauState, h: FloatScalar) -> Stages:
+    """Return the polynomial of the step before, continued, or zero."""
+    known = (state.length > 0) & (jnp.abs(h) <= _FARTHEST * state.length)
+    ratio = jnp.where(known, jnp.abs(h) / jnp.where(known, state.length, 1), 1)
+    Z = state.increments
+    return jnp.where(known, extrapolated(Z, ratio.astype(Z.dtype)), 0)
