@@ -40,9 +40,9 @@ from ._mechanics import (
     rattle as rattle,
     VelocityStabilization as VelocityStabilization,
 )
+from ._radau import RadauIIA5 as RadauIIA5
 from ._resets.record import Resets as Resets
 from ._resets.reset import Reset as Reset, ResetAt as ResetAt
-from ._radau import RadauIIA5 as RadauIIA5
 from ._rosenbrock import MassMatrixTerm as MassMatrixTerm, Rodas3P as Rodas3P, Rodas5P as Rodas5P
 from ._solve.diffeqsolve import diffeqsolve as diffeqsolve
 from ._solve.solution import Solution as Solution

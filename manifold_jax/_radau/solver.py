@@ -20,7 +20,7 @@ from .._rosenbrock.mass_matrix_solver import AbstractMassMatrixSolver
 from .._rosenbrock.solver import RosenbrockInterpolation
 from .._rosenbrock.system import System, Vector
 from .iteration import solve_stages, StageTolerances
-from .stages import constant, extrapolated, SimplifiedNewton, StageEquations, Stages
+from .stages import constant, extrapolated, StageEquations, Stages
 from .tableau import A_INVERSE, DENSE, ERROR
 
 

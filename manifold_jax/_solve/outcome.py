@@ -13,7 +13,7 @@ from jaxtyping import Array
 from .._base.compat import messages_of_results, nonlinear_failure, number_of_result, save_y
 from .._base.types import BoolScalar, IntScalar
 from .._constraint.settings import NewtonProjection
-from .._rosenbrock import AbstractRosenbrock
+from .._rosenbrock import AbstractMassMatrixSolver
 from .._solver import Projected
 from .._solver.base import AbstractManifoldSolver
 from .._solver.step.hook_state import StepStatistics
@@ -86,7 +86,7 @@ def messages_for(solver: dfx.AbstractSolver) -> list[str]:
     if isinstance(solver, AbstractManifoldSolver):
         text = _NOT_CORRECTED if solver.corrects_output else _TOO_LONG
         texts.append((nonlinear_failure(), text))
-    elif isinstance(solver, AbstractRosenbrock):
+    elif isinstance(solver, AbstractMassMatrixSolver):
         texts.append((nonlinear_failure(), _SINGULAR))
     for result, text in texts:
         messages[int(number_of_result(result))] = text

@@ -15,7 +15,7 @@ from .._constraint.checks import check_constraint, check_constraint_type
 from .._constraint.constraint import AbstractConstraint, NoConstraint
 from .._constraint.projection_info import ProjectionInfo
 from .._constraint.settings import NewtonProjection
-from .._rosenbrock import AbstractRosenbrock, MassMatrixTerm
+from .._rosenbrock import AbstractMassMatrixSolver, MassMatrixTerm
 from .interpolation import CorrectedInterpolationFactory
 from .step.execution import AbstractExecution, execution_of
 from .step.frame import StepFrame
@@ -31,7 +31,7 @@ _SUPPORTED = (
     dfx.ImplicitEuler,
     dfx.EulerHeun,
     dfx.StratonovichMilstein,
-    AbstractRosenbrock,
+    AbstractMassMatrixSolver,
 )
 
 
@@ -215,7 +215,7 @@ def _check_inner_solver(solver: Any, hook: str) -> None:
                 f"`HalfSolver({type(solver.solver).__name__}(...))` hides failed steps: put the hook outermost, "
                 f"`{hook}(HalfSolver(solver), constraint)`."
             )
-        if isinstance(solver.solver, dfx.AbstractImplicitSolver | AbstractRosenbrock):
+        if isinstance(solver.solver, dfx.AbstractImplicitSolver | AbstractMassMatrixSolver):
             raise ValueError(
                 f"`HalfSolver({type(solver.solver).__name__}())` does not work in Diffrax: it loses failures of the "
                 "implicit stages. Use the implicit solver itself, it has an error estimate: "
