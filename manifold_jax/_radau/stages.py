@@ -51,11 +51,11 @@ class StageEquations(NamedTuple):
 
     def residual(self, Z: Stages) -> Stages:
         V = constant(A_INVERSE, Z) @ Z
-        return jax.vmap(self.rest)(self.times, self.x0 + Z, V)
+        return jax.vmap(self.rest)(self.times, self.x0[None] + Z, V)
 
     def newton_step(self, Z: Stages) -> Stages:
         """Return the step of Newton's method with the exact matrix, of size `3 n`."""
-        V, X, n = constant(A_INVERSE, Z) @ Z, self.x0 + Z, self.x0.size
+        V, X, n = constant(A_INVERSE, Z) @ Z, self.x0[None] + Z, self.x0.size
         J = jax.vmap(jax.jacfwd(self.rest, argnums=1))(self.times, X, V)
         M = jax.vmap(lambda t, x: as_matrix(self.mass(t, x), n))(self.times, X)
         blocks = -constant(A_INVERSE, Z)[:, :, None, None] * M[:, None]
@@ -90,8 +90,7 @@ class SimplifiedNewton(NamedTuple):
     def of(f0: Vector, M: Float[Array, "..."], J: Float[Array, "n n"]) -> "SimplifiedNewton":
         mass = as_matrix(M, f0.size)
         defined = jnp.all(jnp.isfinite(f0)) & jnp.all(jnp.isfinite(J))
-        unit = jnp.result_type(f0.dtype, jnp.complex64)
-        shifted = jnp.asarray(MU, unit) * mass.astype(unit) - J.astype(unit)
+        shifted = jax.lax.complex(MU.real * mass - J, MU.imag * mass)
         real = factorize_pivoted(GAMMA * mass - J)
         return SimplifiedNewton(f0, M, real, factorize_pivoted(shifted), defined)
 
@@ -121,4 +120,4 @@ def extrapolated(Z: Stages, ratio: FloatScalar) -> Stages:
     for j in range(1, 4):
         factors = [(s - nodes[k]) / (nodes[j] - nodes[k]) for k in range(4) if k != j]
         weights.append(factors[0] * factors[1] * factors[2])
-    return jnp.stack(weights, axis=1) @ Z - Z[2]
+    return jnp.stack(weights, axis=1) @ Z - Z[2:]
