@@ -3,36 +3,23 @@
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 
-from .._base.compat import use_stepsize_tol
 from .._base.types import BoolScalar, FloatScalar, IntScalar, Y
 from .stages import SimplifiedNewton, StageEquations, Stages
 
-
-# Iterations to round-off converge by a factor of 30 or more each in most steps.
-_MOST = 10
 
 # The error of stages that count as solved, in units of the tolerance.
 _KAPPA = 1e-2
 
 
-class StageTolerances(eqx.Module):
-    """The tolerances in which the error of stages is measured: those of the step size controller, which
-    Diffrax (with constant steps [`mj.diffeqsolve`][]) puts in."""
-
-    rtol: Any = use_stepsize_tol
-    atol: Any = use_stepsize_tol
-    norm: Any = use_stepsize_tol
-
-    def size(self, change: Y, y: Y) -> FloatScalar:
-        """Return the size of a change of the state `y`."""
-        scaled = lambda dx, x: dx / (self.atol + self.rtol * jnp.abs(x))
-        with jax.numpy_dtype_promotion("standard"):
-            return jnp.asarray(self.norm(jtu.tree_map(scaled, change, y)))
+def size_in_tolerances(tolerances: Any, change: Y, y: Y) -> FloatScalar:
+    """Return the size of a change of the state `y` in units of the tolerance."""
+    scaled = lambda dx, x: dx / (tolerances.atol + tolerances.rtol * jnp.abs(x))
+    with jax.numpy_dtype_promotion("standard"):
+        return jnp.asarray(tolerances.norm(jtu.tree_map(scaled, change, y)))
 
 
 class Iterate(NamedTuple):
@@ -54,6 +41,7 @@ def solve_stages(
     guess: Stages,
     size: Callable[[Stages], FloatScalar],
     rounding: FloatScalar,
+    most: int,
 ) -> tuple[Stages, BoolScalar]:
     r"""Iterate to round-off, without derivatives: to changes of `size` `rounding`, or to changes below
     `_KAPPA` that no longer shrink.
@@ -65,9 +53,8 @@ def solve_stages(
     def advance(i: Iterate) -> Iterate:
         change = newton.step(equations.residual(i.Z))
         new = size(change)
-        return Iterate(
-            i.Z + change, new, i.size, i.iterations + 1, _status(new, i, rounding, _KAPPA)
-        )
+        status = _status(new, i, rounding, most)
+        return Iterate(i.Z + change, new, i.size, i.iterations + 1, status)
 
     zero = jnp.zeros((), rounding.dtype)
     first = Iterate(guess, zero, zero, jnp.asarray(0), jnp.asarray(_GOES_ON))
@@ -75,18 +62,18 @@ def solve_stages(
     return end.Z, end.status == _SOLVED
 
 
-def _status(new: FloatScalar, i: Iterate, rounding: FloatScalar, kappa: float) -> IntScalar:
+def _status(new: FloatScalar, i: Iterate, rounding: FloatScalar, most: int) -> IntScalar:
     """Return the status after a change of the size `new`.
 
     Source: Hairer & Wanner, Solving ODEs II, IV.8 (8.10, 8.11).
     """
     twice = i.iterations >= 1
     rate = jnp.where(twice, new / jnp.where(twice, i.size, 1), 0)
-    near = new < kappa
+    near = new < _KAPPA
     error = new * rate / (1 - rate)
     finished = (new <= rounding) | twice & near & (rate > 0.3)
-    last = i.iterations + 1 >= _MOST
-    accurate = near | (rate < 1) & (error < kappa)
+    last = i.iterations + 1 >= most
+    accurate = near | (rate < 1) & (error < _KAPPA)
     failed = ~jnp.isfinite(new) | twice & (rate > 2) & ~near | last & ~accurate
     done = jnp.where(finished | last, _SOLVED, _GOES_ON)
     return jnp.where(failed & ~finished, _FAILED, done)

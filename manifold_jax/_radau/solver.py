@@ -8,6 +8,7 @@ import equinox as eqx
 import jax
 import jax.flatten_util as jfu
 import jax.numpy as jnp
+import optimistix as optx
 from diffrax import RESULTS
 
 from .._base.closure import convert_closure
@@ -19,7 +20,7 @@ from .._linalg.rows import product
 from .._rosenbrock.mass_matrix_solver import AbstractMassMatrixSolver
 from .._rosenbrock.solver import RosenbrockInterpolation
 from .._rosenbrock.system import System, Vector
-from .iteration import solve_stages, StageTolerances
+from .iteration import size_in_tolerances, solve_stages
 from .stages import constant, extrapolated, StageEquations, Stages
 from .tableau import A_INVERSE, DENSE, ERROR
 
@@ -57,7 +58,11 @@ class RadauIIA5(AbstractMassMatrixSolver, dfx.AbstractImplicitSolver):
     """Radau."""
 
     checks_start: bool = True  # false if the state has been made consistent before
-    root_finder: StageTolerances = StageTolerances()  # pyright: ignore
+    # Of the root finder only the tolerances are used, in which the error of stages is measured. Those of the
+    # step size controller are put in where the names and the type are these.
+    root_finder: optx.AbstractRootFinder = eqx.field(
+        default_factory=dfx.with_stepsize_controller_tols(dfx.VeryChord)
+    )
     root_find_max_steps: int = eqx.field(default=10, static=True)
 
     term_structure: ClassVar = dfx.AbstractTerm
@@ -119,8 +124,8 @@ class RadauIIA5(AbstractMassMatrixSolver, dfx.AbstractImplicitSolver):
         V0 = jnp.zeros_like(x0) if derivative is None else h.astype(x0.dtype) * derivative
         newton = equations.at_start(V0)
         unravel = jfu.ravel_pytree(equations.system.y0)[1]
-        y0, tolerances = unravel(x0), self.root_finder
-        size = lambda dx: tolerances.size(unravel(dx), y0)
+        y0 = unravel(x0)
+        size = lambda dx: size_in_tolerances(self.root_finder, unravel(dx), y0)
         unit = 8 * jnp.finfo(x0.dtype).eps
         Z, solved = solve_stages(
             equations,
@@ -128,6 +133,7 @@ class RadauIIA5(AbstractMassMatrixSolver, dfx.AbstractImplicitSolver):
             _guess(state, h),
             lambda dZ: jnp.max(jax.vmap(size)(dZ)),
             size(unit * x0),
+            self.root_find_max_steps,
         )
         combination = constant(ERROR, Z) @ Z
         error = newton.filtered(newton.f0, combination)
@@ -138,7 +144,7 @@ class RadauIIA5(AbstractMassMatrixSolver, dfx.AbstractImplicitSolver):
             f = equations.rest(t0, x0 + error, V0) + product(newton.M, V0)
             return newton.filtered(f, combination)
 
-        error = jnp.where(size(error) < 1, error, again())
+        error = jax.lax.cond(size(error) < 1, lambda: error, again)
         solved &= newton.nonsingular
         Z = jnp.where(solved, Z, 0)
         return _Step(Z, error, newton.defined, solved)

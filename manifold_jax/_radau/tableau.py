@@ -26,9 +26,10 @@ def _decoupled() -> tuple[float, complex, np.ndarray]:
     $T^{-1} A^{-1} T = \mathrm{diag}(\gamma, \begin{pmatrix} \alpha & -\beta \\ \beta & \alpha
     \end{pmatrix})$ (IV.8.5)."""
     values, vectors = np.linalg.eig(A_INVERSE)
-    real, other = np.argmin(np.abs(values.imag)), np.argmax(values.imag)
-    T = np.stack([vectors[:, real].real, vectors[:, other].real, -vectors[:, other].imag], axis=1)
-    return float(values[real].real), complex(values[other]), T
+    real, other = np.argmin(np.abs(np.imag(values))), np.argmax(np.imag(values))
+    pair = vectors[:, other]
+    T = np.stack([np.real(vectors[:, real]), np.real(pair), -np.imag(pair)], axis=1)
+    return float(np.real(values[real])), complex(values[other]), T
 
 
 GAMMA, MU, T = _decoupled()

@@ -1,0 +1,213 @@
+"""The Radau IIA method: orders, published solutions, derivatives, masses, and failed stages."""
+
+import diffrax as dfx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+import pytest
+from diffrax import RESULTS
+from test_rosenbrock import (
+    constant_mass,
+    constant_singular,
+    curved,
+    forced,
+    FORCED_START,
+    path,
+    pendulum,
+    PENDULUM_MASS,
+    ROD,
+    terms_of,
+    varying_mass,
+    varying_singular,
+)
+
+import manifold_jax as mj
+from benchmarks.tools.stiff_problems import PROBLEMS
+
+
+RADAU = mj.RadauIIA5()
+
+
+# --- orders ---------------------------------------------------------------------------------------
+
+
+def test_orders_of_one_step():
+    """The state, the embedded solution and the dense output, each from the exact state."""
+    solver = mj.RadauIIA5(root_finder=dfx.VeryChord(rtol=1e-8, atol=1e-8, norm=optx.rms_norm))
+    terms, exact, starts = dfx.ODETerm(forced), path(forced, FORCED_START, 1.0), np.linspace(0, 0.8, 7)
+
+    @jax.jit
+    @jax.vmap
+    def step(t0, y0, h):
+        state = solver.init(terms, t0, t0 + h, y0, None)
+        y1, error, info, _, _ = solver.step(terms, t0, t0 + h, y0, None, state, False)
+        interpolation = solver.interpolation_cls(t0=t0, t1=t0 + h, **info)
+        return jnp.stack([y1, y1 - error, interpolation.evaluate(t0 + 0.4 * h)])
+
+    def errors(h):
+        values = step(starts, exact(starts).T, np.full(7, h))
+        ends = np.stack([exact(starts + c * h).T for c in (1, 1, 0.4)], axis=1)
+        return np.linalg.norm(values - ends, axis=(0, 2))
+
+    orders = np.log2(errors(0.04) / errors(0.02))
+    np.testing.assert_allclose(orders, [6, 4, 4], rtol=0, atol=0.2)
+
+
+@pytest.mark.parametrize("case", [constant_singular, varying_singular])
+def test_orders(case):
+    """Of DAEs of index 1; with a mass matrix that depends on time and state, too."""
+    terms, y0, end = case(0.9)
+
+    @jax.jit
+    def solve(dt):
+        sol = mj.diffeqsolve(terms, RADAU, 0.0, 0.9, dt, jnp.asarray(y0), throw=False)
+        return sol.ys[0], sol.result == RESULTS.successful
+
+    errors = []
+    for n in (8, 16):
+        y1, success = solve(0.9 / n)
+        assert success
+        errors.append(np.linalg.norm(y1 - end))
+    assert errors[-1] > 1e-13
+    assert abs(np.log2(errors[0] / errors[1]) - 5) <= 0.2, errors
+
+
+def test_order_of_fast_components():
+    """The reduction that the docstring states, and that it is divided by the stiffness."""
+    follow = lambda t, y, rate: -rate * (y - jnp.sin(t)) + jnp.cos(t)
+
+    @jax.jit
+    def error(n, rate):
+        y0, saveat = jnp.sin(jnp.zeros(1)), dfx.SaveAt(steps=True)
+        options = dict(args=rate, saveat=saveat, max_steps=64, throw=False)
+        sol = mj.diffeqsolve(dfx.ODETerm(follow), RADAU, 0.0, 2.0, 2 / n, y0, **options)
+        error = jnp.abs(sol.ys[:, 0] - jnp.sin(sol.ts))
+        return jnp.max(jnp.where(jnp.isfinite(sol.ts), error, 0))
+
+    assert abs(np.log2(error(8.0, 1e6) / error(16.0, 1e6)) - 3) <= 0.2
+    assert abs(error(8.0, 1e5) / error(8.0, 1e6) - 10) <= 1
+
+
+# --- published solutions --------------------------------------------------------------------------
+
+
+def digits(problem, tolerance=1.0, **options):
+    """Of the worst component, and the number of steps."""
+    controller = dfx.PIDController(rtol=problem.rtol * tolerance, atol=problem.atol * tolerance)
+    options = dict(stepsize_controller=controller, throw=False, **options)
+    solve = lambda y0: mj.diffeqsolve(
+        terms_of(problem), RADAU, 0.0, problem.t1, None, y0, problem.args, **options
+    )
+    sol = jax.jit(solve)(jnp.asarray(problem.y0))
+    assert sol.result == RESULTS.successful
+    found = -np.log10(np.max(np.abs(sol.ys[0] / problem.end - 1)))
+    return found, sol.stats["num_steps"]
+
+
+@pytest.mark.parametrize(
+    ("problem", "tolerance", "least", "most_steps"),
+    [
+        ("Robertson, DAE", 1.0, 9.0, 1350),
+        pytest.param("chemical Akzo Nobel", 1.0, 9.0, 200, marks=pytest.mark.slow),
+        pytest.param("transistor amplifier", 1e3, 5.5, 1100, marks=pytest.mark.slow),
+    ],
+)
+def test_published_solutions(problem, tolerance, least, most_steps):
+    found, steps = digits(PROBLEMS[problem], tolerance)
+    assert found > least
+    assert steps < most_steps
+
+
+# --- derivatives ----------------------------------------------------------------------------------
+
+
+PARAMETERS = jnp.array([1.0, 0.9, 1.3, 0.8])  # the last is the start
+
+
+def end_of_curved(parameters, adjoint, mass):
+    *args, x0 = parameters
+    y0 = {"x": x0[None], "w": jnp.zeros(())}  # w is made consistent
+    term = mj.MassMatrixTerm(curved, mass(args))
+    sol = mj.diffeqsolve(term, RADAU, 0.0, 1.0, 0.25, y0, args, adjoint=adjoint)
+    return sol.ys["x"][0, 0] + 2 * sol.ys["w"][0]
+
+
+@pytest.mark.parametrize(
+    "mass", [constant_mass, pytest.param(varying_mass, marks=pytest.mark.slow)]
+)
+def test_gradients_agree(mass):
+    """Reverse mode with forward mode and differences; second derivatives with differences of first ones."""
+    end = lambda adjoint: lambda p: end_of_curved(p, adjoint, mass)
+    reverse = jax.grad(end(mj.StepReplayAdjoint()))
+    everything = jax.jit(lambda p: (reverse(p), jax.jvp(reverse, (p,), (jnp.ones_like(p),))[1]))
+    forward = jax.jit(lambda p: (end(dfx.ForwardMode())(p), jax.jacfwd(end(dfx.ForwardMode()))(p)))
+    first, second = everything(PARAMETERS)
+    np.testing.assert_allclose(first, forward(PARAMETERS)[1], rtol=1e-11)
+    at = lambda step: forward(PARAMETERS + step)
+    steps = 1e-5 * jnp.eye(4)
+    differences = jnp.stack([at(step)[0] - at(-step)[0] for step in steps]) / 2e-5
+    np.testing.assert_allclose(first, differences, rtol=1e-8)
+    along = 1e-5 * jnp.ones(4)
+    np.testing.assert_allclose(second, (at(along)[1] - at(-along)[1]) / 2e-5, rtol=1e-7)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("adjoint", [dfx.RecursiveCheckpointAdjoint(), dfx.DirectAdjoint()])
+def test_gradients_of_diffrax_agree(adjoint):
+    gradient = lambda adjoint: jax.grad(end_of_curved)(PARAMETERS, adjoint, constant_mass)
+    np.testing.assert_allclose(gradient(adjoint), gradient(mj.StepReplayAdjoint()), rtol=1e-11)
+
+
+# --- batches, types, directions -------------------------------------------------------------------
+
+
+def decay(t, y, k):
+    """Stiff, with a field that is not a number for negative `k` from t = 1/2 on."""
+    a, b = y["a"], y["b"]
+    fast = -1e3 * (b - jnp.cos(a)) + jnp.sqrt(jnp.where(t > 0.5, k, jnp.abs(k)))[None]
+    return {"a": b - 0.3 * a, "b": fast}
+
+
+def decayed(k, dtype=jnp.float64):
+    y0 = {"a": jnp.array([0.3], dtype), "b": jnp.array([1.0], dtype)}
+    tolerance = 1e-7 if dtype == jnp.float64 else 1e-4
+    time = lambda t: jnp.asarray(t, dtype)
+    return dfx.diffeqsolve(
+        dfx.ODETerm(decay),
+        RADAU,
+        *(time(0.0), time(1.0), time(1e-3)),
+        y0,
+        k,
+        stepsize_controller=dfx.PIDController(rtol=tolerance, atol=tolerance),
+        throw=False,
+    )
+
+
+def test_batches_and_single_precision():
+    """As alone, and a lane whose field stops being a number hurts no other."""
+    k = jnp.array([0.5, -1.0, 2.0])
+    batch = jax.jit(jax.vmap(decayed))(k)
+    single = jax.jit(decayed)
+    np.testing.assert_array_equal(batch.result == RESULTS.successful, [True, False, True])
+    assert batch.stats["num_steps"][1] < 200  # not until `max_steps`
+    for i in (0, 2):
+        alone = single(k[i])
+        np.testing.assert_allclose(batch.ys["a"][i], alone.ys["a"], rtol=1e-13)
+        assert batch.stats["num_steps"][i] == alone.stats["num_steps"]
+    rough = jax.jit(lambda k: decayed(k, dtype=jnp.float32))(jnp.asarray(0.5, jnp.float32))
+    assert rough.ys["a"].dtype == jnp.float32
+    assert rough.result == RESULTS.successful
+    np.testing.assert_allclose(rough.ys["a"], batch.ys["a"][0], rtol=2e-4)
+
+
+def test_backwards_in_time():
+    """To where it came from; the mass matrix depends on the true time."""
+    terms, y0, end = varying_singular(0.9)
+    controller = dfx.PIDController(rtol=1e-10, atol=1e-10)
+    solve = lambda y: mj.diffeqsolve(
+        terms, RADAU, 0.9, 0.0, None, y, stepsize_controller=controller, throw=False
+    )
+    sol = jax.jit(solve)(jnp.asarray(end))
+    np.testing.assert_allclose(sol.ys[0], y0, rtol=0, atol=1e-9)
+    assert sol.stats["num_steps"] < 60
