@@ -38,7 +38,7 @@ class StageEquations(NamedTuple):
     @property
     def times(self) -> Float[Array, " 3"]:
         # Not rounded beyond the end, where the field may jump.
-        inside = [self.system.time(c) for c in C[:2]]
+        inside = [self.system.time(c) for c in C.tolist()[:2]]
         return jnp.stack([*inside, jnp.asarray(self.system.t1, inside[0].dtype)])
 
     def mass(self, t: RealScalarLike, x: Vector) -> Float[Array, "..."]:
@@ -115,7 +115,7 @@ def extrapolated(Z: Stages, ratio: FloatScalar) -> Stages:
     """Return guesses of the stages from those of the step before, whose length is `1 / ratio` of this
     one's: the collocation polynomial, continued."""
     s = 1 + constant(C, Z) * ratio
-    nodes = [0.0, *C]
+    nodes = [0.0, *C.tolist()]
     weights = []
     for j in range(1, 4):
         factors = [(s - nodes[k]) / (nodes[j] - nodes[k]) for k in range(4) if k != j]
