@@ -7,6 +7,7 @@ import numpy as np
 import optimistix as optx
 import pytest
 from diffrax import RESULTS
+from scipy.integrate import solve_ivp
 from test_rosenbrock import (
     constant_mass,
     constant_singular,
@@ -14,6 +15,9 @@ from test_rosenbrock import (
     forced,
     FORCED_START,
     path,
+    pendulum,
+    PENDULUM_MASS,
+    ROD,
     terms_of,
     varying_mass,
     varying_singular,
@@ -24,6 +28,7 @@ from benchmarks.tools.stiff_problems import PROBLEMS
 
 
 RADAU = mj.RadauIIA5()
+TOLERANCES = dfx.VeryChord(rtol=1e-8, atol=1e-8, norm=optx.rms_norm)
 
 
 # --- orders ---------------------------------------------------------------------------------------
@@ -31,7 +36,7 @@ RADAU = mj.RadauIIA5()
 
 def test_orders_of_one_step():
     """The state, the embedded solution and the dense output, each from the exact state."""
-    solver = mj.RadauIIA5(root_finder=dfx.VeryChord(rtol=1e-8, atol=1e-8, norm=optx.rms_norm))
+    solver = mj.RadauIIA5(root_finder=TOLERANCES)
     terms, exact, starts = (
         dfx.ODETerm(forced),
         path(forced, FORCED_START, 1.0),
@@ -126,38 +131,62 @@ def test_published_solutions(problem, tolerance, least, most_steps):
 PARAMETERS = jnp.array([1.0, 0.9, 1.3, 0.8])  # the last is the start
 
 
-def end_of_curved(parameters, adjoint, mass):
+def problem_of(parameters, mass):
     *args, x0 = parameters
-    y0 = {"x": x0[None], "w": jnp.zeros(())}  # w is made consistent
-    term = mj.MassMatrixTerm(curved, mass(args))
+    return mj.MassMatrixTerm(curved, mass(args)), {"x": x0[None], "w": jnp.array(0.6)}, args
+
+
+def test_derivatives_of_a_step():
+    """First and second ones, with differences. The start need not be consistent here."""
+    solver = mj.RadauIIA5(checks_start=False, root_finder=TOLERANCES)
+
+    def after(parameters):
+        term, y, args = problem_of(parameters, varying_mass)
+        state = solver.init(term, 0.0, 0.2, y, args)
+        y, _, info, _, _ = solver.step(term, 0.0, 0.2, y, args, state, False)
+        return y["x"][0] + 2 * y["w"] + info["k"][1]["w"]
+
+    gradient = jax.jit(jax.value_and_grad(after))
+    second = jax.jit(jax.jacrev(jax.grad(after)))(PARAMETERS)
+    np.testing.assert_allclose(jax.jit(jax.jacfwd(after))(PARAMETERS), gradient(PARAMETERS)[1])
+    sides = [[gradient(PARAMETERS + s * step) for s in (1, -1)] for step in 1e-5 * jnp.eye(4)]
+    differences = jax.tree.map(
+        lambda *x: jnp.stack(x) / 2e-5, *[jax.tree.map(jnp.subtract, *pair) for pair in sides]
+    )
+    np.testing.assert_allclose(gradient(PARAMETERS)[1], differences[0], rtol=1e-8)
+    np.testing.assert_allclose(second, differences[1], rtol=1e-7, atol=1e-9)
+
+
+def end_of_curved(parameters, adjoint, mass):
+    term, y0, args = problem_of(parameters, mass)  # w is made consistent
     sol = mj.diffeqsolve(term, RADAU, 0.0, 1.0, 0.25, y0, args, adjoint=adjoint)
     return sol.ys["x"][0, 0] + 2 * sol.ys["w"][0]
 
 
-@pytest.mark.parametrize(
-    "mass", [constant_mass, pytest.param(varying_mass, marks=pytest.mark.slow)]
-)
-def test_gradients_agree(mass):
-    """Reverse mode with forward mode and differences; second derivatives with differences of first ones."""
-    end = lambda adjoint: lambda p: end_of_curved(p, adjoint, mass)
-    reverse = jax.grad(end(mj.StepReplayAdjoint()))
-    everything = jax.jit(lambda p: (reverse(p), jax.jvp(reverse, (p,), (jnp.ones_like(p),))[1]))
-    forward = jax.jit(lambda p: (end(dfx.ForwardMode())(p), jax.jacfwd(end(dfx.ForwardMode()))(p)))
-    first, second = everything(PARAMETERS)
-    np.testing.assert_allclose(first, forward(PARAMETERS)[1], rtol=1e-11)
-    at = lambda step: forward(PARAMETERS + step)
-    steps = 1e-5 * jnp.eye(4)
-    differences = jnp.stack([at(step)[0] - at(-step)[0] for step in steps]) / 2e-5
-    np.testing.assert_allclose(first, differences, rtol=1e-8)
-    along = 1e-5 * jnp.ones(4)
-    np.testing.assert_allclose(second, (at(along)[1] - at(-along)[1]) / 2e-5, rtol=1e-7)
+def test_gradients_agree():
+    """Of a whole solve."""
+    both = jax.jit(jax.value_and_grad(end_of_curved), static_argnums=(1, 2))
+    value = lambda p: both(p, mj.StepReplayAdjoint(), constant_mass)
+    differences = [
+        (value(PARAMETERS + step)[0] - value(PARAMETERS - step)[0]) / 2e-5
+        for step in 1e-5 * jnp.eye(4)
+    ]
+    np.testing.assert_allclose(value(PARAMETERS)[1], jnp.stack(differences), rtol=1e-8)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("adjoint", [dfx.RecursiveCheckpointAdjoint(), dfx.DirectAdjoint()])
-def test_gradients_of_diffrax_agree(adjoint):
-    gradient = lambda adjoint: jax.grad(end_of_curved)(PARAMETERS, adjoint, constant_mass)
-    np.testing.assert_allclose(gradient(adjoint), gradient(mj.StepReplayAdjoint()), rtol=1e-11)
+def test_other_modes_agree():
+    """Forward mode and the adjoints of Diffrax, and second derivatives of both modes."""
+    end = lambda adjoint: lambda p: end_of_curved(p, adjoint, varying_mass)
+    reverse, along = jax.grad(end(mj.StepReplayAdjoint())), jnp.ones(4)
+    first, second = jax.jit(lambda p: jax.jvp(reverse, (p,), (along,)))(PARAMETERS)
+    forward = jax.jit(jax.jacfwd(end(dfx.ForwardMode())))
+    np.testing.assert_allclose(first, forward(PARAMETERS), rtol=1e-11)
+    sides = forward(PARAMETERS + 1e-5 * along), forward(PARAMETERS - 1e-5 * along)
+    np.testing.assert_allclose(second, (sides[0] - sides[1]) / 2e-5, rtol=1e-7)
+    for adjoint in (dfx.RecursiveCheckpointAdjoint(), dfx.DirectAdjoint()):
+        other = jax.jit(jax.grad(end(adjoint)))(PARAMETERS)
+        np.testing.assert_allclose(other, first, rtol=1e-11)
 
 
 # --- batches, types, directions -------------------------------------------------------------------
@@ -212,3 +241,78 @@ def test_backwards_in_time():
     sol = jax.jit(solve)(jnp.asarray(end))
     np.testing.assert_allclose(sol.ys[0], y0, rtol=0, atol=1e-9)
     assert sol.stats["num_steps"] < 60
+
+
+def test_jumps_of_the_field():
+    """The derivative that is carried is that behind a jump: a solve across it is as good as two that end and
+    begin there."""
+    mass = lambda t, y, args: jnp.diag(2 + jnp.sin(3 * y))
+    tight = dfx.PIDController(rtol=1e-9, atol=1e-9)
+    jumping = dfx.ClipStepSizeController(tight, jump_ts=jnp.array([0.5]))
+    term = mj.MassMatrixTerm(lambda t, y, push: push[jnp.where(t < 0.5, 0, 1)] - y, mass)
+
+    @jax.jit
+    def solve(push, t0, t1, y0):
+        return dfx.diffeqsolve(term, RADAU, t0, t1, 0.01, y0, push, stepsize_controller=jumping)
+
+    y0, push = jnp.array([0.1, 0.4]), jnp.array([1.0, 3.0])
+    whole, first = solve(push, 0.0, 1.0, y0), solve(push[:1].repeat(2), 0.0, 0.5, y0)
+    second = solve(push[1:].repeat(2), 0.5, 1.0, first.ys[0])
+    np.testing.assert_allclose(whole.ys[0], second.ys[0], rtol=1e-8)
+    steps = first.stats["num_steps"] + second.stats["num_steps"]
+    assert whole.stats["num_steps"] < steps + 4
+
+
+# --- on manifolds, and failures -------------------------------------------------------------------
+
+
+def test_projected_dae_keeps_hidden_constraints():
+    y0 = jnp.array([1.0, 0.0]), jnp.zeros(2), jnp.zeros(())
+
+    @jax.jit
+    def solve(y0):
+        sol = mj.diffeqsolve(
+            mj.MassMatrixTerm(pendulum, PENDULUM_MASS),
+            mj.Projected(RADAU, ROD),
+            0.0,
+            2.0,
+            None,
+            y0,
+            saveat=dfx.SaveAt(ts=jnp.linspace(0.0, 2.0, 9)),
+            stepsize_controller=dfx.PIDController(rtol=1e-8, atol=1e-8),
+        )
+        return sol.ys
+
+    q, v, multiplier = solve(y0)
+    assert np.abs(np.sum(q * q, axis=1) - 1).max() < 2e-15
+    assert np.abs(np.sum(q * v, axis=1)).max() < 4e-15
+    exact, _ = mj.problems.pendulum().reference(np.linspace(0.0, 2.0, 9))
+    np.testing.assert_allclose(q, exact, rtol=0, atol=1e-7)
+    # Tension: v^2 / r and the weight along the rod.
+    np.testing.assert_allclose(multiplier, np.sum(v * v, 1) - 9.81 * q[:, 1], atol=1e-6)
+
+
+def test_stages_that_do_not_converge():
+    """Van der Pol's oscillator with a first step that is far too long: rejected, or with constant steps the
+    end of the solve."""
+    field = lambda t, y, args: jnp.stack([y[1], 1e4 * ((1 - y[0] ** 2) * y[1] - y[0])])
+    start, terms = jnp.array([2.0, -0.66]), dfx.ODETerm(field)
+    controller = dfx.PIDController(rtol=1e-5, atol=1e-5)
+    options = dict(stepsize_controller=controller, throw=False)
+    sol = jax.jit(lambda y0: dfx.diffeqsolve(terms, RADAU, 0.0, 0.5, 1e3, y0, **options))(start)
+    assert sol.result == RESULTS.successful
+    assert sol.stats["num_rejected_steps"] > 0
+    reference = solve_ivp(
+        lambda t, y: np.asarray(field(t, y, None)), (0, 0.5), start, "Radau", rtol=1e-9, atol=1e-11
+    )
+    np.testing.assert_allclose(sol.ys[0], reference.y[:, -1], rtol=1e-4)
+    failed = mj.diffeqsolve(terms, RADAU, 0.0, 2.0, 1.0, start, throw=False)
+    assert failed.result == RESULTS.nonlinear_divergence
+    assert failed.stats["num_steps"] == 1
+
+
+def test_controls_are_refused():
+    control = dfx.LinearInterpolation(jnp.linspace(0, 1, 3), jnp.linspace(0, 1, 3))
+    terms = dfx.ControlTerm(lambda t, y, args: -y, control)
+    with pytest.raises(ValueError, match="to_ode"):
+        mj.diffeqsolve(terms, RADAU, 0.0, 1.0, 0.1, jnp.array(1.0))

@@ -43,7 +43,7 @@ class AbstractManifoldSolver(dfx.AbstractWrappedSolver):
     saved values, events and the dense solution for it, too, which it cannot do for an unknown
     wrapper. An implementation is a dataclass with these three fields, a class variable and two methods:
 
-    - `inner`: the wrapped solver, a one-step method of Diffrax or a Rosenbrock method.
+    - `inner`: the wrapped solver, a one-step method of Diffrax or of this library.
     - `constraint`: the manifold, an [`AbstractConstraint`][].
     - `projection`: how corrections are made, [`NewtonProjection`][].
     - `corrects_output`: whether steps end on the manifold, and values between steps are to be
