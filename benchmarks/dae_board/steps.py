@@ -31,7 +31,7 @@ from ..tools.measure import environment, make_console, use_double_precision, wri
 from ..tools.stiff_problems import PROBLEMS
 from .__main__ import every_problem
 from .peers import with_scipy_dae
-from .solve import Reduction, residual_in_numbers
+from .solve import MAX_STEPS, Reduction, residual_in_numbers
 
 
 TOLERANCES = 1e-5, 1e-6, 1e-7, 1e-8
@@ -69,6 +69,26 @@ def ours(name: str, reduction: Reduction, method: str) -> list[Row]:
     for tolerance in TOLERANCES:
         sol = solve(z0, tolerance)
         digits = problem.digits(reduction.outputs(sol.ys[-1], reduction.args, problem.t1))
+        rows.append(Row(name, method, tolerance, digits, int(sol.stats["num_steps"])))
+    return rows
+
+
+def with_its_mass(method: str) -> list[Row]:
+    """The transistor amplifier as it is written, with a singular mass matrix."""
+    board = every_problem()["transistor amplifier"]
+    problem = PROBLEMS["transistor amplifier"]
+    term = mj.MassMatrixTerm(problem.field(jnp), problem.mass)
+
+    @jax.jit
+    def solve(y0: Any, tolerance: Any) -> Any:
+        controller = dfx.PIDController(rtol=tolerance, atol=tolerance)
+        options: Any = dict(stepsize_controller=controller, max_steps=MAX_STEPS, throw=False)
+        return mj.diffeqsolve(term, getattr(mj, method)(), 0.0, problem.t1, None, y0, **options)
+
+    rows, name = [], "transistor amplifier, M y' = f"
+    for tolerance in TOLERANCES:
+        sol = solve(jnp.asarray(problem.y0), tolerance)
+        digits = board.digits({"u": sol.ys[-1]})
         rows.append(Row(name, method, tolerance, digits, int(sol.stats["num_steps"])))
     return rows
 
@@ -116,7 +136,9 @@ def estimates(method: str, tolerance: float = 1e-7) -> EstimateRow:
 
     def solve(t0: Any, t1: Any, y0: Any, dt0: Any, tolerance: float, solver: Any, save: Any) -> Any:
         controller = dfx.PIDController(rtol=tolerance, atol=tolerance)
-        options = dict(saveat=save, stepsize_controller=controller, max_steps=10_000, throw=False)
+        options: Any = dict(
+            saveat=save, stepsize_controller=controller, max_steps=10_000, throw=False
+        )
         return mj.diffeqsolve(term, solver, t0, t1, dt0, y0, consistent="assume", **options)
 
     solver = getattr(mj, method)(checks_start=False)
@@ -131,7 +153,7 @@ def estimates(method: str, tolerance: float = 1e-7) -> EstimateRow:
 
     def one(t0: Any, t1: Any, y0: Any) -> tuple[Any, Any]:
         state = solver.init(term, t0, t1, y0, None)
-        y1, error, *_ = solver.step(term, t0, t1, y0, None, state, False)
+        y1, error = solver.step(term, t0, t1, y0, None, state, False)[:2]
         fine = solve(t0, t1, y0, (t1 - t0) / 8, 1e-10, mj.RadauIIA5(), dfx.SaveAt(t1=True))
         scale = tolerance * (1 + jnp.abs(y1))
         return optx.rms_norm(error / scale), optx.rms_norm((y1 - fine.ys[0]) / scale)
@@ -141,10 +163,10 @@ def estimates(method: str, tolerance: float = 1e-7) -> EstimateRow:
 
 
 def at_digits(rows: list[Row], digits: float) -> float:
-    """Return the number of steps for so many digits, interpolated."""
+    """Return the number of steps for so many digits, interpolated; NaN outside of the rows."""
     rows = sorted(rows, key=lambda row: row.digits)
-    logs = np.interp(digits, [r.digits for r in rows], np.log([r.steps for r in rows]))
-    return float(np.exp(logs))
+    steps = np.log([row.steps for row in rows])
+    return float(np.exp(np.interp(digits, [r.digits for r in rows], steps, np.nan, np.nan)))
 
 
 def print_tables(console: Console, rows: list[Row], of_estimates: list[EstimateRow]) -> None:
@@ -182,6 +204,7 @@ def main(
         rows += scipy_radau(name, reduction)
         if find_spec("scipy_dae") is not None:
             rows += scipy_dae_radau(name, reduction)
+    rows += [row for method in METHODS for row in with_its_mass(method)]
     of_estimates = [estimates(method) for method in METHODS]
     print_tables(make_console(), rows, of_estimates)
     if json is not None:

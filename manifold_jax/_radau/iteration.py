@@ -43,11 +43,11 @@ def solve_stages(
     rounding: FloatScalar,
     most: int,
 ) -> tuple[Stages, BoolScalar]:
-    r"""Iterate to round-off, without derivatives: to changes of `size` `rounding`, or to changes below
-    `_KAPPA` that no longer shrink.
+    r"""Iterate to round-off, without derivatives: until the error, estimated from the rate $\theta$ of
+    convergence as $|\Delta Z| \theta / (1 - \theta)$, has at most the size `rounding`, or changes below
+    `_KAPPA` no longer shrink.
 
-    Where iterations end before, stages are solved if their error, estimated from the rate $\theta$ as
-    $|\Delta Z| \theta / (1 - \theta)$, is below `_KAPPA`.
+    Where iterations end before, stages are solved if their error is below `_KAPPA`.
     """
 
     def advance(i: Iterate) -> Iterate:
@@ -68,12 +68,12 @@ def _status(new: FloatScalar, i: Iterate, rounding: FloatScalar, most: int) -> I
     Source: Hairer & Wanner, Solving ODEs II, IV.8 (8.10, 8.11).
     """
     twice = i.iterations >= 1
-    rate = jnp.where(twice, new / jnp.where(twice, i.size, 1), 0)
+    rate = jnp.where(twice, new / jnp.where(twice, i.size, 1), jnp.inf)
     near = new < _KAPPA
-    error = new * rate / (1 - rate)
-    finished = (new <= rounding) | twice & near & (rate > 0.3)
+    error = jnp.where(rate < 1, new * rate / (1 - rate), jnp.inf)
+    finished = (jnp.minimum(new, error) <= rounding) | twice & near & (rate > 0.3)
     last = i.iterations + 1 >= most
-    accurate = near | (rate < 1) & (error < _KAPPA)
+    accurate = near | (error < _KAPPA)
     failed = ~jnp.isfinite(new) | twice & (rate > 2) & ~near | last & ~accurate
     done = jnp.where(finished | last, _SOLVED, _GOES_ON)
     return jnp.where(failed & ~finished, _FAILED, done)

@@ -58,7 +58,7 @@ class RadauIIA5(AbstractMassMatrixSolver, dfx.AbstractImplicitSolver):
     r"""Radau IIA method of order 5 with three implicit stages, for stiff ODEs and, with a
     [`MassMatrixTerm`][], differential-algebraic equations of index 1. Stiffly accurate and L-stable.
 
-    A step is a polynomial of degree three, the dense output, that satisfies $M y' = h f$ in three points
+    A step is a polynomial of degree three, the dense output, that satisfies the equations in three points
     of which the last is the end of the step. The stages are solved to round-off by simplified Newton
     iterations with the Jacobian at the beginning: one real and one complex factorization of the size of
     the state per step. They start from the polynomial of the step before. Where they do not converge
@@ -76,9 +76,9 @@ class RadauIIA5(AbstractMassMatrixSolver, dfx.AbstractImplicitSolver):
     $h^3 / |\lambda|$ while $h |\lambda| \gg 1$. The error estimate has order 3 and the dense output, too:
     with small tolerances errors are far below them (on the transistor amplifier 9.5 digits at 1e-8).
 
-    Prefer it to [`Rodas5P`][] for tight tolerances, singular mass matrices that depend on the state, and
-    where evaluating Jacobians is expensive; a step takes two to seven times as long as one of
-    [`Rodas5P`][], which is faster where steps are equally many.
+    Prefer it to [`Rodas5P`][] for singular mass matrices that depend on time or state, for stiff
+    mechanisms, and where many digits are needed. A step takes one (long vector fields) to seven times as
+    long as one of [`Rodas5P`][], which is faster where steps are equally many.
 
     **Arguments:**
 
@@ -141,7 +141,7 @@ class RadauIIA5(AbstractMassMatrixSolver, dfx.AbstractImplicitSolver):
         state = without_derivative(solver_state)
         fixed = StageEquations(*without_derivative((system, x0)))
         derivative = fixed.system.refreshed(made_jump, state.derivative, fixed.x0)
-        step = self._solve(fixed, state, derivative)
+        step = without_derivative(self._solve(fixed, state, derivative))
         newton_step = StageEquations(system, x0).newton_step
         Z = root_of_step(convert_closure(newton_step, step.Z), step.Z)
         ok = jnp.all(jnp.isfinite(step.error)) & jnp.all(jnp.isfinite(step.Z))
