@@ -246,8 +246,7 @@ def test_single_precision():
 
 
 def test_jumps_of_the_field():
-    """The derivative that is carried is that behind a jump: a solve across it is as good as two that end and
-    begin there."""
+    """A solve across a jump is as good as two that end and begin there."""
     mass = lambda t, y, args: jnp.diag(2 + jnp.sin(3 * y))
     tight = dfx.PIDController(rtol=1e-9, atol=1e-9)
     jumping = dfx.ClipStepSizeController(tight, jump_ts=jnp.array([0.5]))

@@ -22,7 +22,7 @@ def size_in_tolerances(tolerances: Any, change: Y, y: Y) -> FloatScalar:
         return jnp.asarray(tolerances.norm(jtu.tree_map(scaled, change, y)))
 
 
-class Iterate(NamedTuple):
+class StageIterate(NamedTuple):
     """`size` and `previous` are those of the last two changes, in units of the tolerance."""
 
     Z: Stages
@@ -43,26 +43,26 @@ def solve_stages(
     rounding: FloatScalar,
     most: int,
 ) -> tuple[Stages, BoolScalar]:
-    r"""Iterate to round-off, without derivatives: until the error, estimated from the rate $\theta$ of
+    r"""StageIterate to round-off, without derivatives: until the error, estimated from the rate $\theta$ of
     convergence as $|\Delta Z| \theta / (1 - \theta)$, has at most the size `rounding`, or changes below
     `_KAPPA` no longer shrink.
 
     Where iterations end before, stages are solved if their error is below `_KAPPA`.
     """
 
-    def advance(i: Iterate) -> Iterate:
+    def advance(i: StageIterate) -> StageIterate:
         change = newton.step(equations.residual(i.Z))
         new = size(change)
         status = _status(new, i, rounding, most)
-        return Iterate(i.Z + change, new, i.size, i.iterations + 1, status)
+        return StageIterate(i.Z + change, new, i.size, i.iterations + 1, status)
 
     zero = jnp.zeros((), rounding.dtype)
-    first = Iterate(guess, zero, zero, jnp.asarray(0), jnp.asarray(_GOES_ON))
+    first = StageIterate(guess, zero, zero, jnp.asarray(0), jnp.asarray(_GOES_ON))
     end = jax.lax.while_loop(lambda i: i.status == _GOES_ON, advance, first)
     return end.Z, end.status == _SOLVED
 
 
-def _status(new: FloatScalar, i: Iterate, rounding: FloatScalar, most: int) -> IntScalar:
+def _status(new: FloatScalar, i: StageIterate, rounding: FloatScalar, most: int) -> IntScalar:
     """Return the status after a change of the size `new`.
 
     Source: Hairer & Wanner, Solving ODEs II, IV.8 (8.10, 8.11).

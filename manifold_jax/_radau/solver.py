@@ -45,7 +45,7 @@ class RadauState(eqx.Module):
     length: FloatScalar
 
 
-class _Step(NamedTuple):
+class _StagesOfStep(NamedTuple):
     """The stages, the error estimate, and whether the equations are defined and the stages solved."""
 
     Z: Stages
@@ -158,7 +158,7 @@ class RadauIIA5(AbstractMassMatrixSolver, dfx.AbstractImplicitSolver):
 
     def _solve(
         self, equations: StageEquations, state: RadauState, derivative: Vector | None
-    ) -> _Step:
+    ) -> _StagesOfStep:
         """Return the stages and the error estimate, without derivatives."""
         x0, h = equations.x0, equations.system.step
         V0 = jnp.zeros_like(x0) if derivative is None else h.astype(x0.dtype) * derivative
@@ -187,7 +187,7 @@ class RadauIIA5(AbstractMassMatrixSolver, dfx.AbstractImplicitSolver):
         error = jax.lax.cond(size(error) < 1, lambda: error, again)
         solved &= newton.nonsingular
         Z = jnp.where(solved, Z, 0)
-        return _Step(Z, error, newton.defined, solved)
+        return _StagesOfStep(Z, error, newton.defined, solved)
 
     def _after(self, system: System, state: RadauState, Z: Stages) -> RadauState:
         h = system.step
