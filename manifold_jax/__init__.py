@@ -40,6 +40,7 @@ from ._mechanics import (
     rattle as rattle,
     VelocityStabilization as VelocityStabilization,
 )
+from ._radau import RadauIIA5 as RadauIIA5
 from ._resets.record import Resets as Resets
 from ._resets.reset import Reset as Reset, ResetAt as ResetAt
 from ._rosenbrock import MassMatrixTerm as MassMatrixTerm, Rodas3P as Rodas3P, Rodas5P as Rodas5P

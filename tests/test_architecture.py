@@ -21,6 +21,7 @@ LAYERS = [
     {"_linalg.sparse"},
     {"_constraint"},
     {"_rosenbrock"},
+    {"_radau"},
     {"_solver.step"},
     {"_solver"},
     {"_resets"},

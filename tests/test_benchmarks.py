@@ -50,6 +50,7 @@ SMALLEST = {
 }
 # Those that compile or train for minutes whatever their settings: imported, not run.
 TOO_LONG = {
+    "benchmarks.dae_board.steps",
     "benchmarks.peers.mechanisms_mujoco",
     "benchmarks.peers.neural",
     "benchmarks.peers.robots",

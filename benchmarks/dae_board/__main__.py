@@ -6,7 +6,7 @@ For each: what the reduction found, digits against the published (or elementary)
 steps, run time, how far constraints are violated there; the derivative of the unknowns by a parameter
 in both modes and by differences; and IDA (scikit-sundae) and Radau (scipy_dae), where installed, on
 the same residual. `--quick` leaves out derivatives and other libraries. With `--problems`, the rows of
-other problems that are in the file FILE are kept.
+other problems that are in the file FILE are kept; `--solver RadauIIA5` takes another one for stiff problems.
 """
 
 import dataclasses
@@ -228,6 +228,7 @@ def draw(rows: list[Row], path: Path) -> None:
 
 def main(
     problems: Annotated[str, typer.Option(help="names, separated by commas; all if empty")] = "",
+    solver: Annotated[str, typer.Option(help="of stiff problems, instead of Rodas5P")] = "Rodas5P",
     quick: Annotated[bool, typer.Option(help="no derivatives and no other libraries")] = False,
     repeats: Annotated[int, typer.Option(help="timed runs of each program")] = 3,
     json: Annotated[Path | None, typer.Option(help="where to write the result")] = None,
@@ -239,6 +240,9 @@ def main(
     unknown = [name for name in names if name not in made]
     if unknown:
         raise typer.BadParameter(f"no problem {unknown[0]!r}. There are: {', '.join(made)}.")
+    for name in names:
+        if made[name].solver == "Rodas5P":
+            made[name] = made[name]._replace(solver=solver)
     for name, title in PEERS.items():
         if not quick and name not in installed():
             console.print(f"{title}: skipped. It needs {name}: `pip install '.[peers]'`")

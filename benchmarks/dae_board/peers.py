@@ -46,7 +46,7 @@ def installed() -> list[str]:
 
 
 def run_peers(reduction: Reduction) -> list[PeerRow]:
-    solvers = {"sksundae": _ida, "scipy_dae": _scipy_dae, "casadi": _casadi}
+    solvers = {"sksundae": _ida, "scipy_dae": with_scipy_dae, "casadi": _casadi}
     residual, x0, xdot0 = residual_in_numbers(reduction)
     unravel = jfu.ravel_pytree(reduction.start)[1]
     rows = []
@@ -89,7 +89,7 @@ def _ida(reduction: Reduction, residual: Callable, x0: Any, xdot0: Any) -> tuple
     return sol.y[-1], len(sol.t) - 1, bool(sol.success)
 
 
-def _scipy_dae(
+def with_scipy_dae(
     reduction: Reduction, residual: Callable, x0: Any, xdot0: Any
 ) -> tuple[Any, int, bool]:
     integrate = importlib.import_module("scipy_dae.integrate")

@@ -72,7 +72,7 @@ def reduce_dae(
         zeros count as structure.
     - `order`: the highest derivative among the arguments of `F`, 1 to 3.
     - `form`: `"ode"` solves for the derivatives, for any solver. `"index-1"` leaves the equations for
-        them to [`Rodas5P`][], as unknowns of their own after the state: for stiff equations, and
+        them to [`Rodas5P`][] or [`RadauIIA5`][], as unknowns of their own after the state: for stiff equations, and
         where they are nonlinear in their highest derivatives or multipliers (friction, diodes),
         which then need not become states.
 

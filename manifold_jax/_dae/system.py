@@ -31,7 +31,7 @@ class ReducedDAE(eqx.Module):
     @property
     def terms(self) -> dfx.ODETerm | MassMatrixTerm:
         """The vector field on the state, a Diffrax term; NaN where the equations do not determine it.
-        With `form="index-1"` a [`MassMatrixTerm`][] for [`Rodas5P`][] and [`Rodas3P`][]."""
+        With `form="index-1"` a [`MassMatrixTerm`][] for [`Rodas5P`][], [`Rodas3P`][] and [`RadauIIA5`][]."""
         analysis = self.system.analysis
         if not analysis.implicit:
             return dfx.ODETerm(self.system.field)

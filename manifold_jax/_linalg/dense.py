@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import jax.scipy.linalg as jsl
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Inexact
 
 from .._base.derivative_rule import ForwardRule
 from .._base.types import BoolScalar, FloatScalar
@@ -38,7 +38,7 @@ class Factorization(eqx.Module):
     usable: BoolScalar  # full rank
     product: Callable = eqx.field(static=True)  # multiplies `A` by a solution
 
-    def solve(self, b: Float[Array, "m ..."]) -> Float[Array, "m ..."]:
+    def solve(self, b: Inexact[Array, "m ..."]) -> Inexact[Array, "m ..."]:
         return jax.lax.custom_linear_solve(
             lambda x: self.product(self.A, x),
             b,
@@ -50,12 +50,12 @@ class Factorization(eqx.Module):
 class Library(eqx.Module):
     """`A = L U` with row exchanges, by LAPACK or cuSOLVER."""
 
-    lu: tuple[Float[Array, "m m"], Array]
+    lu: tuple[Inexact[Array, "m m"], Array]
 
-    def solve(self, b: Float[Array, "m ..."]) -> Float[Array, "m ..."]:
+    def solve(self, b: Inexact[Array, "m ..."]) -> Inexact[Array, "m ..."]:
         return jsl.lu_solve(self.lu, b)
 
-    def solve_transposed(self, b: Float[Array, "m ..."]) -> Float[Array, "m ..."]:
+    def solve_transposed(self, b: Inexact[Array, "m ..."]) -> Inexact[Array, "m ..."]:
         return jsl.lu_solve(self.lu, b, trans=1)
 
 

@@ -7,7 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.scipy.linalg as jsl
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Inexact
 
 from .._base.types import BoolScalar, FloatScalar
 from .dense import Factorization, Library, rank_threshold, UNROLL_LIMIT
@@ -26,10 +26,10 @@ _UNROLLED_COLUMNS = 4
 class UnrolledElimination(eqx.Module):
     """`E A = U`, upper triangular, with inverse pivots on its diagonal. `E` has the row exchanges."""
 
-    U: list[list[FloatScalar]]
-    E: Float[Array, "n n"]
+    U: list[list[Inexact[Array, ""]]]
+    E: Inexact[Array, "n n"]
 
-    def solve(self, b: Float[Array, " n"]) -> Float[Array, " n"]:
+    def solve(self, b: Inexact[Array, " n"]) -> Inexact[Array, " n"]:
         x = list(combine(b, self.E.T))
         n = len(x)
         for i in reversed(range(n)):
@@ -38,7 +38,7 @@ class UnrolledElimination(eqx.Module):
             x[i] = x[i] * self.U[i][i]
         return jnp.stack(x)
 
-    def solve_transposed(self, b: Float[Array, " n"]) -> Float[Array, " n"]:
+    def solve_transposed(self, b: Inexact[Array, " n"]) -> Inexact[Array, " n"]:
         x = list(b)
         for i in range(len(x)):
             for k in range(i):
@@ -48,15 +48,16 @@ class UnrolledElimination(eqx.Module):
 
 
 def factorize_pivoted(
-    A: Float[Array, "n n"], largest_written_out: int = LARGEST_WRITTEN_OUT
+    A: Inexact[Array, "n n"], largest_written_out: int = LARGEST_WRITTEN_OUT
 ) -> Factorization:
-    """Factor any matrix with row exchanges; one that is singular or not finite becomes the identity."""
+    """Factor any matrix, also a complex one, with row exchanges; one that is singular or not finite
+    becomes the identity."""
     fixed, eye = jax.lax.stop_gradient(A), jnp.eye(A.shape[0], dtype=A.dtype)
     factors, nonsingular = (_eliminate if A.shape[0] <= largest_written_out else _lapack)(fixed)
     return Factorization(jnp.where(nonsingular, A, eye), factors, nonsingular, multiply)
 
 
-def _lapack(A: Float[Array, "n n"]) -> tuple[Library, BoolScalar]:
+def _lapack(A: Inexact[Array, "n n"]) -> tuple[Library, BoolScalar]:
     lu, pivots = jsl.lu_factor(A)
     nonsingular = jnp.all(jnp.isfinite(lu)) & jnp.all(jnp.diagonal(lu) != 0)
     lu = jnp.where(nonsingular, lu, jnp.eye(A.shape[0], dtype=A.dtype))
@@ -64,7 +65,7 @@ def _lapack(A: Float[Array, "n n"]) -> tuple[Library, BoolScalar]:
     return Library((lu, pivots)), nonsingular
 
 
-def _eliminate(A: Float[Array, "n n"]) -> tuple[UnrolledElimination, BoolScalar]:
+def _eliminate(A: Inexact[Array, "n n"]) -> tuple[UnrolledElimination, BoolScalar]:
     """Eliminate with partial pivoting. The largest entry of a column is brought to the pivot by
     comparing and exchanging pairs of rows, without indices that are known only at run time."""
     n = A.shape[0]

@@ -5,7 +5,7 @@ from typing import Any, Protocol, runtime_checkable, TYPE_CHECKING, TypeAlias
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Inexact
 
 from .dense import gram, UNROLL_LIMIT
 
@@ -58,7 +58,7 @@ class InverseWeights(eqx.Module):
 if TYPE_CHECKING:
     Rows: TypeAlias = Any  # code that knows that rows are an array uses them as one
 else:
-    Rows: TypeAlias = Float[Array, "_ _"] | AbstractRows
+    Rows: TypeAlias = Inexact[Array, "_ _"] | AbstractRows
 
 
 def directions_of(metric: Metric, C: Rows) -> Rows:
@@ -66,7 +66,7 @@ def directions_of(metric: Metric, C: Rows) -> Rows:
     return C.along(metric) if isinstance(C, AbstractRows) else metric.solve(C)
 
 
-def combine(weights: Float[Array, " m"], rows: Rows) -> Float[Array, " n"]:
+def combine(weights: Inexact[Array, " m"], rows: Rows) -> Inexact[Array, " n"]:
     """`sum_i weights_i rows_i`."""
     if isinstance(rows, AbstractRows):
         return rows.combine(weights)

@@ -27,8 +27,8 @@ class MassMatrixTerm(dfx.AbstractTerm):
     r"""`M(t, y, args) y' = f(t, y, args)`: an implicit ODE, or where `M` is singular a
     differential-algebraic equation (DAE) of index 1.
 
-    For [`Rodas5P`][] and [`Rodas3P`][], alone or in [`Projected`][]. All other solvers
-    would ignore the mass matrix, and raise.
+    For [`Rodas5P`][], [`Rodas3P`][] and [`RadauIIA5`][], alone or in [`Projected`][]. All other
+    solvers would ignore the mass matrix, and raise.
 
     The left null space of `M` says which equations are algebraic: $u^T M = 0$ leaves
     $0 = u^T f(t, y)$. The index is 1 where these equations determine the part of `y` that `M` does
@@ -81,8 +81,8 @@ class MassMatrixTerm(dfx.AbstractTerm):
     def prod(self, vf: Any, control: RealScalarLike) -> NoReturn:
         """Return the increment for solvers that do not know of mass matrices."""
         raise ValueError(
-            "`terms` is an `mj.MassMatrixTerm`, whose mass matrix this solver would ignore. Use `mj.Rodas5P()` or "
-            "`mj.Rodas3P()`, alone or in `mj.Projected`. For another solver and a regular mass matrix solve for y' in "
+            "`terms` is an `mj.MassMatrixTerm`, whose mass matrix this solver would ignore. Use `mj.Rodas5P()`, "
+            "`mj.Rodas3P()` or `mj.RadauIIA5()`, alone or in `mj.Projected`. For another solver and a regular mass matrix solve for y' in "
             "the vector field of a `diffrax.ODETerm`."
         )
 

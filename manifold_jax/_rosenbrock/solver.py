@@ -11,13 +11,12 @@ import jax.tree_util as jtu
 from diffrax import RESULTS
 from jaxtyping import Array, Float
 
-from .._base.compat import is_okay, is_sde, nonlinear_failure, undirected
+from .._base.compat import is_okay, nonlinear_failure
 from .._base.rejection import is_repeatable, rejecting
 from .._base.types import Args, BoolScalar, FloatScalar, RealScalarLike, Y
-from .._constraint.checks import check_state
 from .._linalg.pivoted import LARGEST_WRITTEN_OUT
 from .._linalg.sparse import Choice
-from .algebraic import is_consistent
+from .mass_matrix_solver import AbstractMassMatrixSolver
 from .sparsity import check_structure
 from .stages import rosenbrock_step
 from .system import System
@@ -60,7 +59,7 @@ class RosenbrockState(eqx.Module):
     usable: BoolScalar
 
 
-class AbstractRosenbrock(dfx.AbstractAdaptiveSolver):
+class AbstractRosenbrock(AbstractMassMatrixSolver):
     """Linearly implicit one-step methods: instead of nonlinear equations each stage has a linear
     system. All have the same matrix `M / gamma - h df/dy`, which is factored once per step."""
 
@@ -85,17 +84,8 @@ class AbstractRosenbrock(dfx.AbstractAdaptiveSolver):
     def init(
         self, terms: Any, t0: RealScalarLike, t1: RealScalarLike, y0: Y, args: Args
     ) -> RosenbrockState:
-        check_state(y0)
-        _check_terms(terms)
-        derivative, usable = None, jnp.asarray(True)
         system = System.of(terms, t0, t1, y0, args)
-        if system.mass is not None:
-            x, _ = jfu.ravel_pytree(y0)
-            start, derivative = system.at_start(x, self.structure)
-            if self.checks_start:
-                usable = is_consistent(x, start)
-            if not callable(system.mass.mass):
-                derivative = None
+        derivative, usable = self.derivative_at_start(system, y0, self.structure)
         return RosenbrockState(jnp.abs(jnp.asarray(t1) - t0), derivative, usable)
 
     def step(
@@ -197,13 +187,3 @@ class Rodas3P(AbstractRosenbrock):
     """
 
     tableau: ClassVar[RosenbrockTableau] = RODAS3P
-
-
-def _check_terms(terms: Any) -> None:
-    is_control = lambda x: isinstance(x, dfx.ControlTerm)
-    leaves = jtu.tree_leaves(undirected(terms), is_leaf=is_control)
-    if is_sde(terms) or any(is_control(leaf) for leaf in leaves):
-        raise ValueError(
-            "`terms` has noise or a control, which Rosenbrock methods are not for: they need df/dt. Of a smooth control "
-            "make an ODE, `diffrax.ControlTerm(f, control).to_ode()`."
-        )

@@ -71,8 +71,8 @@ def diffeqsolve(
 
     - `solver`: [`Projected`][] or another solver of this library; if its constraint has no equations the
         solver inside it is used alone. (Any other solver of Diffrax is used as it is, for comparisons,
-        also with implicit stages solved to round-off.) [`Rodas5P`][] and [`Rodas3P`][], alone or
-        wrapped, for stiff equations; they take a [`MassMatrixTerm`][].
+        also with implicit stages solved to round-off.) [`Rodas5P`][], [`Rodas3P`][] and
+        [`RadauIIA5`][], alone or wrapped, for stiff equations; they take a [`MassMatrixTerm`][].
     - `dt0`: `None` with an adaptive controller chooses the first step from the vector field
         (Hairer, Norsett & Wanner, Solving ODEs I, II.4).
     - `consistent`: what to do with `y0`. `"project"` moves it onto the manifold, `"check"`

@@ -8,7 +8,7 @@ import jax.tree_util as jtu
 
 from .._base.types import FloatScalar, Y
 from .._constraint.diagnosis import Diagnosis
-from .._rosenbrock import AbstractRosenbrock, MassMatrixTerm
+from .._rosenbrock import AbstractMassMatrixSolver, MassMatrixTerm
 from .._rosenbrock.algebraic import faults_of_start, INCONSISTENT, is_small
 from .setup import Consistent, ProblemData, Setup
 
@@ -33,11 +33,11 @@ def consistent_with_mass(setup: Setup, data: ProblemData) -> tuple[Y, FloatScala
 
 def trusting(solver: Any, consistent: Consistent) -> Any:
     """Return the solver without its own check of the start, if that is to be trusted."""
-    is_rosenbrock = lambda x: isinstance(x, AbstractRosenbrock)
+    takes_masses = lambda x: isinstance(x, AbstractMassMatrixSolver)
     if consistent != "assume":
         return solver
     return jtu.tree_map(
-        lambda s: dataclasses.replace(s, checks_start=False) if is_rosenbrock(s) else s,
+        lambda s: dataclasses.replace(s, checks_start=False) if takes_masses(s) else s,
         solver,
-        is_leaf=is_rosenbrock,
+        is_leaf=takes_masses,
     )

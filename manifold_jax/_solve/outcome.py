@@ -13,7 +13,7 @@ from jaxtyping import Array
 from .._base.compat import messages_of_results, nonlinear_failure, number_of_result, save_y
 from .._base.types import BoolScalar, IntScalar
 from .._constraint.settings import NewtonProjection
-from .._rosenbrock import AbstractRosenbrock
+from .._rosenbrock import AbstractMassMatrixSolver
 from .._solver import Projected
 from .._solver.base import AbstractManifoldSolver
 from .._solver.step.hook_state import StepStatistics
@@ -40,7 +40,8 @@ NO_TIME = "`t0` or `t1` is NaN (or `t0` infinite): nothing was solved."
 _SINGULAR = (
     "A step could not be made: `y0` does not satisfy the algebraic equations (see "
     "`mj.MassMatrixTerm.consistent_state`), or the matrix M - h gamma df/dy is singular or not finite, as where the index "
-    "of M y' = f is above 1 (reduce it, for example with `mj.reduce_dae`)."
+    "of M y' = f is above 1 (reduce it, for example with `mj.reduce_dae`), or the stages of `mj.RadauIIA5` have no solution "
+    "at this step size."
 )
 _TOO_MANY = (
     "The maximum number of solver steps was reached. A long solve needs a larger `max_steps`, a stiff one `mj.Rodas5P()`; "
@@ -86,7 +87,7 @@ def messages_for(solver: dfx.AbstractSolver) -> list[str]:
     if isinstance(solver, AbstractManifoldSolver):
         text = _NOT_CORRECTED if solver.corrects_output else _TOO_LONG
         texts.append((nonlinear_failure(), text))
-    elif isinstance(solver, AbstractRosenbrock):
+    elif isinstance(solver, AbstractMassMatrixSolver):
         texts.append((nonlinear_failure(), _SINGULAR))
     for result, text in texts:
         messages[int(number_of_result(result))] = text

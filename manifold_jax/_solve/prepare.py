@@ -10,7 +10,7 @@ import jax.tree_util as jtu
 from .._base.types import RealScalarLike, Y
 from .._constraint.checks import check_constraint, check_state
 from .._constraint.constraint import NoConstraint
-from .._rosenbrock import AbstractRosenbrock, MassMatrixTerm
+from .._rosenbrock import AbstractMassMatrixSolver, MassMatrixTerm
 from .._solver.base import AbstractManifoldSolver, controller_tolerances
 from .._solver.step.execution import ExplicitStep
 from .._solver.step.hook_state import HookState
@@ -35,7 +35,7 @@ class Ready(NamedTuple):
 def prepare(setup: Setup, data: ProblemData) -> Ready:
     """Make the start consistent, and choose the first step if `dt0` is None. A method of Diffrax
     without a hook is left to Diffrax, for comparisons."""
-    if not isinstance(setup.solver, AbstractManifoldSolver | AbstractRosenbrock):
+    if not isinstance(setup.solver, AbstractManifoldSolver | AbstractMassMatrixSolver):
         return Ready(data, setup.dt0, None, StartInfo(jnp.zeros(()), jnp.asarray(True)))
     dtype = time_dtype(data.t0, data.t1, setup.dt0, setup.saveat)
     t0, t1 = jnp.asarray(data.t0, dtype), jnp.asarray(data.t1, dtype)
@@ -81,7 +81,7 @@ def as_state(y0: Y, dtype: Any) -> Y:
 def _chosen_first_step(setup: Setup, data: ProblemData) -> FirstStep | None:
     terms, tolerances = setup.terms, controller_tolerances(setup.controller)
     inner = getattr(setup.solver, "inner", setup.solver)
-    if isinstance(setup.solver, Unconstrained) and not isinstance(inner, AbstractRosenbrock):
+    if isinstance(setup.solver, Unconstrained) and not isinstance(inner, AbstractMassMatrixSolver):
         return None  # left to Diffrax
     if isinstance(terms, MassMatrixTerm):
         terms = dfx.ODETerm(terms.derivative)

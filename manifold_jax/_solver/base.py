@@ -15,7 +15,7 @@ from .._constraint.checks import check_constraint, check_constraint_type
 from .._constraint.constraint import AbstractConstraint, NoConstraint
 from .._constraint.projection_info import ProjectionInfo
 from .._constraint.settings import NewtonProjection
-from .._rosenbrock import AbstractRosenbrock, MassMatrixTerm
+from .._rosenbrock import AbstractMassMatrixSolver, MassMatrixTerm
 from .interpolation import CorrectedInterpolationFactory
 from .step.execution import AbstractExecution, execution_of
 from .step.frame import StepFrame
@@ -31,7 +31,7 @@ _SUPPORTED = (
     dfx.ImplicitEuler,
     dfx.EulerHeun,
     dfx.StratonovichMilstein,
-    AbstractRosenbrock,
+    AbstractMassMatrixSolver,
 )
 
 
@@ -43,7 +43,7 @@ class AbstractManifoldSolver(dfx.AbstractWrappedSolver):
     saved values, events and the dense solution for it, too, which it cannot do for an unknown
     wrapper. An implementation is a dataclass with these three fields, a class variable and two methods:
 
-    - `inner`: the wrapped solver, a one-step method of Diffrax or a Rosenbrock method.
+    - `inner`: the wrapped solver, a one-step method of Diffrax or of this library.
     - `constraint`: the manifold, an [`AbstractConstraint`][].
     - `projection`: how corrections are made, [`NewtonProjection`][].
     - `corrects_output`: whether steps end on the manifold, and values between steps are to be
@@ -215,7 +215,7 @@ def _check_inner_solver(solver: Any, hook: str) -> None:
                 f"`HalfSolver({type(solver.solver).__name__}(...))` hides failed steps: put the hook outermost, "
                 f"`{hook}(HalfSolver(solver), constraint)`."
             )
-        if isinstance(solver.solver, dfx.AbstractImplicitSolver | AbstractRosenbrock):
+        if isinstance(solver.solver, dfx.AbstractImplicitSolver | AbstractMassMatrixSolver):
             raise ValueError(
                 f"`HalfSolver({type(solver.solver).__name__}())` does not work in Diffrax: it loses failures of the "
                 "implicit stages. Use the implicit solver itself, it has an error estimate: "
