@@ -86,15 +86,15 @@ def ambient_riccati():
 
 def test_the_error_is_of_second_order():
     S, errors = ambient_riccati(), []
-    for number in (11, 21):
+    for number in (21, 41):
         sol = swing(lambda t, y: PUSH, START, jnp.linspace(0.0, 1.0, number))
         inputs = jnp.broadcast_to(PUSH, (number, 2))
         terms, manifold = BALL.terms, BALL.constraint
         found = mj.regulate(terms, manifold, sol.ts, sol.ys, inputs, **BALL_WEIGHTS)
         T = found.bases[0]
         errors.append(np.abs(found.riccati[0] - T.T @ S @ T).max() / np.abs(T.T @ S @ T).max())
-    assert errors[1] < 3e-3
-    assert 3.6 < errors[0] / errors[1] < 4.4
+    assert errors[1] < 6e-3
+    assert 3.7 < errors[0] / errors[1] < 4.2
 
 
 def test_it_returns_to_its_trajectory():
@@ -119,7 +119,7 @@ def test_it_returns_to_its_trajectory():
         max(float(jnp.abs(a[-1] - b[-1]).max()) for a, b in zip(run.ys, sol.ys))
         for run in (swing(lambda t, y: PUSH, aside, times), swing(feedback, aside, times))
     ]
-    assert distances[0] > 0.3
+    assert distances[0] > 20 * distances[1]
     assert distances[1] < 2e-3
 
 
@@ -177,19 +177,18 @@ BAD = {
     r"`inputs` must have the shape \(3, m\)": dict(inputs=jnp.ones(3)),
     r"`state_weights` must be a number, or have the shape \(2,\)": dict(state_weights=jnp.ones(5)),
     "`input_weights` must be positive": dict(input_weights=0.0),
-    "turns by more than 60 degrees": dict(ts=jnp.array([0.0, 1.0, 2.0])),
-    "no solution from t = 0.2": dict(state_weights=-60.0),
+    "from t = 1 to 2 the tangent space turns by more than 60 degrees": dict(
+        ys=jnp.array([[1.0, 0.0], [0.8, 0.6], [-0.6, 0.8]])
+    ),
+    "`state_weights` must not be negative": dict(state_weights=-1.0),
+    "Riccati equation is not finite from t = 1": dict(state_weights=1e300, input_weights=1e-300),
 }
 
 
 @pytest.mark.parametrize("message", BAD)
 def test_bad_arguments(message):
-    turns = "60 degrees" in message
-    good = around(3) if turns else around(11) if "no solution" in message else around(3)
-    if turns:
-        good["ys"] = jnp.array([[1.0, 0.0], [0.8, 0.6], [-0.6, 0.8]])
     with pytest.raises(ValueError, match=message):
-        mj.regulate(TURNING, CIRCLE, **(good | BAD[message]))
+        mj.regulate(TURNING, CIRCLE, **around(3, **BAD[message]))
 
 
 def test_inputs_that_do_nothing_and_equations_twice():

@@ -33,8 +33,8 @@ _NO_EFFECT = (
     "`mb.Assembly(..., [mb.Controller(joints, lambda t, y, args: args)])`."
 )
 _DIVERGED = (
-    "The Riccati equation has no solution from t = {t:.6g} on backwards: weights of the state must not be negative, and the times "
-    "so close that the linearized motion changes by no more than some ten times from one to the next."
+    "The Riccati equation is not finite from t = {t:.6g} on backwards. Give more times: the linearized motion should change by no "
+    "more than some ten times from one to the next."
 )
 
 
@@ -138,7 +138,7 @@ def regulate(
         _as_matrix("input_weights", input_weights, inputs.shape[1]),
         _as_matrix("final_weights", final_weights, n),
     )
-    _check_positive(weights[1])
+    _check_weights(*weights)
     regulator, B, cosines = _regulate(terms, constraint, ts, ys, inputs, weights)
     if not isinstance(cosines, jax.core.Tracer):
         _raise_if_unusable(regulator, np.asarray(B), np.asarray(cosines))
@@ -233,7 +233,17 @@ def _as_matrix(name: str, weights: Any, size: int) -> Float[Array, "size size"]:
     return jnp.diag(jnp.broadcast_to(weights, (size,)))
 
 
-def _check_positive(R: Float[Array, "m m"]) -> None:
+def _check_weights(
+    Q: Float[Array, "n n"], R: Float[Array, "m m"], final: Float[Array, "n n"]
+) -> None:
+    for name, weights in (("state_weights", Q), ("final_weights", final)):
+        if isinstance(weights, jax.core.Tracer):
+            continue
+        values = np.linalg.eigvalsh(np.asarray(weights))
+        if not values.min() >= -1e-9 * np.abs(values).max():
+            raise ValueError(
+                f"`{name}` must not be negative (a positive semidefinite matrix): there would be no least cost."
+            )
     if not isinstance(R, jax.core.Tracer) and not np.linalg.eigvalsh(np.asarray(R)).min() > 0:
         raise ValueError(
             "`input_weights` must be positive (a positive definite matrix): an input that costs nothing would be infinite. Write a "
@@ -242,7 +252,8 @@ def _check_positive(R: Float[Array, "m m"]) -> None:
 
 
 def _raise_if_unusable(regulator: Regulator, B: np.ndarray, cosines: np.ndarray) -> None:
-    ts, finite = np.asarray(regulator.ts), np.isfinite(cosines)
+    ts, finite = np.asarray(regulator.ts), np.isfinite(cosines) & np.isfinite(B).all(axis=(1, 2))
+    finite &= B.shape[1] > 0  # no direction is left where as many equations as numbers are written
     if not finite.all():
         raise ValueError(_DEPENDENT.format(t=ts[np.argmin(finite)]))
     if not cosines.min() > _TURNED:
@@ -250,6 +261,7 @@ def _raise_if_unusable(regulator: Regulator, B: np.ndarray, cosines: np.ndarray)
         raise ValueError(_TOO_FEW.format(before=ts[k - 1], t=ts[k]))
     if not np.any(B):
         raise ValueError(_NO_EFFECT)
-    solved = np.isfinite(np.asarray(regulator.riccati)).all(axis=(1, 2))
+    S = np.asarray(regulator.riccati)
+    solved = np.isfinite(S).all(axis=(1, 2))
     if not solved.all():
         raise ValueError(_DIVERGED.format(t=ts[np.flatnonzero(~solved).max()]))
