@@ -208,7 +208,7 @@ def _checked_trajectory(ts: Any, ys: Any, inputs: Any) -> tuple[Array, Y, Array]
     ts, inputs = jnp.asarray(ts, dtype), jnp.asarray(inputs, dtype)
     if ts.ndim != 1 or ts.size < 2:
         raise ValueError(f"`ts` must be at least two times, shape (K,), got shape {ts.shape}.")
-    if not isinstance(ts, jax.core.Tracer) and not np.all(np.diff(np.asarray(ts)) > 0):
+    if not isinstance(ts, jax.core.Tracer) and not bool(jnp.all(jnp.diff(ts) > 0)):
         raise ValueError("`ts` must be finite and increase from each time to the next.")
     for name, leaf in [("ys", leaf) for leaf in jtu.tree_leaves(ys)] + [("inputs", inputs)]:
         if leaf.ndim == 0 or leaf.shape[0] != ts.size:
@@ -244,7 +244,10 @@ def _check_weights(
             raise ValueError(
                 f"`{name}` must not be negative (a positive semidefinite matrix): there would be no least cost."
             )
-    if not isinstance(R, jax.core.Tracer) and not np.linalg.eigvalsh(np.asarray(R)).min() > 0:
+    if (
+        not isinstance(R, jax.core.Tracer)
+        and not float(np.linalg.eigvalsh(np.asarray(R)).min()) > 0
+    ):
         raise ValueError(
             "`input_weights` must be positive (a positive definite matrix): an input that costs nothing would be infinite. Write a "
             "small number for inputs that are cheap."
