@@ -109,8 +109,8 @@ def test_it_returns_to_its_trajectory():
             times,
             ys,
             inputs,
-            state_weights=100.0,
-            input_weights=0.01,
+            state_weights=jnp.repeat(jnp.array([100.0, 1.0]), 3),
+            input_weights=1e-3,
             final_weights=10.0,
         )
     )(sol.ys)

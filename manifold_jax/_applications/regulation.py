@@ -208,7 +208,8 @@ def _checked_trajectory(ts: Any, ys: Any, inputs: Any) -> tuple[Array, Y, Array]
     ts, inputs = jnp.asarray(ts, dtype), jnp.asarray(inputs, dtype)
     if ts.ndim != 1 or ts.size < 2:
         raise ValueError(f"`ts` must be at least two times, shape (K,), got shape {ts.shape}.")
-    if not isinstance(ts, jax.core.Tracer) and not bool(jnp.all(jnp.diff(ts) > 0)):
+    known = np.arange(2.0) if isinstance(ts, jax.core.Tracer) else np.asarray(ts, float)
+    if not np.all(known[1:] > known[:-1]):
         raise ValueError("`ts` must be finite and increase from each time to the next.")
     for name, leaf in [("ys", leaf) for leaf in jtu.tree_leaves(ys)] + [("inputs", inputs)]:
         if leaf.ndim == 0 or leaf.shape[0] != ts.size:
