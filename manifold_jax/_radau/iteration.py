@@ -43,7 +43,7 @@ def solve_stages(
     rounding: FloatScalar,
     most: int,
 ) -> tuple[Stages, BoolScalar]:
-    r"""StageIterate to round-off, without derivatives: until the error, estimated from the rate $\theta$ of
+    r"""Iterate to round-off, without derivatives: until the error, estimated from the rate $\theta$ of
     convergence as $|\Delta Z| \theta / (1 - \theta)$, has at most the size `rounding`, or changes below
     `_KAPPA` no longer shrink.
 
