@@ -183,6 +183,10 @@ def test_consistent_starts_as_dense():
     assert info.residual < 1e-15
     np.testing.assert_array_equal(sparse["v"], guess["v"])
     np.testing.assert_allclose(sparse["e"], unravel(dense)["e"], rtol=1e-13)
+    rates = unravel(term.equations(guess, ARGS).at(0.2, dense).derivative)
+    found = term.derivative(0.2, sparse, ARGS)
+    for name in ("v", "e"):
+        np.testing.assert_allclose(found[name], rates[name], rtol=1e-12, atol=1e-14)
     index_2 = mj.MassMatrixTerm(lambda t, y, args: {"v": y["e"], "e": y["v"]}, term.mass)
     with pytest.raises(RuntimeError, match="index of M y' = f is above 1"):
         index_2.consistent_state(0.2, guess, ARGS)
