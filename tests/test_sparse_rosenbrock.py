@@ -143,7 +143,7 @@ def methods_found(monkeypatch):
 def test_solutions_and_gradients_as_dense(monkeypatch):
     methods = methods_found(monkeypatch)
     program = jax.value_and_grad(end, argnums=2, has_aux=True)
-    run = lambda structure: jax.jit(lambda args: program(structure, filters(30), args))(ARGS)
+    run = lambda structure: jax.jit(lambda args: program(structure, filters(32), args))(ARGS)
     (_, sparse), by_sparse = run("auto")
     assert methods() == {"blocks"}
     (_, dense), by_dense = run("dense")
@@ -162,7 +162,7 @@ def test_a_batch_with_exchanges_of_rows(monkeypatch):
     ends, factors = jnp.asarray([0.1, 0.3]), jnp.asarray([1.0, 1.5])
 
     def along(structure, factor, t1):
-        run = lambda factor: end(structure, filters(30, shift=1), factor * ARGS, t1)[0]
+        run = lambda factor: end(structure, filters(32, shift=1), factor * ARGS, t1)[0]
         return jax.value_and_grad(run)(factor)
 
     batch = jax.jit(jax.vmap(lambda f, t1: along("auto", f, t1)))(factors, ends)
@@ -174,8 +174,8 @@ def test_a_batch_with_exchanges_of_rows(monkeypatch):
 
 
 def test_consistent_starts_as_dense():
-    term, y0 = filters(30)
-    guess = {"v": jnp.cos(jnp.arange(30.0)), "e": y0["e"]}
+    term, y0 = filters(32)
+    guess = {"v": jnp.cos(jnp.arange(32.0)), "e": y0["e"]}
     sparse, info = term.consistent_state(0.2, guess, ARGS)
     x, unravel = jax.flatten_util.ravel_pytree(guess)
     dense, _ = consistent(term.equations(guess, ARGS), 0.2, x)
@@ -204,7 +204,7 @@ def test_the_program_does_not_grow_with_the_system():
 def test_masses_that_are_not_known():
     """A mass that is an input of the program may be zero: without an unknown of its own for each
     equation the systems are then dense, and otherwise sparse."""
-    x, mass = jnp.ones(60), jnp.ones(60)
+    x, mass = jnp.ones(70), jnp.ones(70)
     shifted = sparsity.choose_sparsity("auto", lambda x: jnp.roll(x, 1), x, mass)
     assert shifted is None
     own = sparsity.choose_sparsity("auto", lambda x: x - jnp.append(x[1:], 0.0), x, mass)
@@ -213,7 +213,7 @@ def test_masses_that_are_not_known():
 
 def wide(x):
     """Each equation with five random unknowns."""
-    return jnp.sum(x[np.random.default_rng(0).integers(60, size=(5, 60))], axis=0)
+    return jnp.sum(x[np.random.default_rng(0).integers(70, size=(5, 70))], axis=0)
 
 
 @pytest.mark.parametrize(
@@ -221,18 +221,18 @@ def wide(x):
     [
         ("few unknowns", lambda x: jnp.roll(x[:10], 1), None, True, None),
         ("neighbours", lambda x: jnp.diff(x, append=0.0), None, False, "blocks"),
-        ("no own unknown", lambda x: jnp.roll(x, 1), np.zeros(60), False, None),
-        ("no own unknown", lambda x: jnp.roll(x, 1), np.zeros(60), True, "klu"),
-        ("own unknown", lambda x: x + jnp.append(x[1:], 0.0), np.zeros(60), True, "blocks"),
+        ("no own unknown", lambda x: jnp.roll(x, 1), np.zeros(70), False, None),
+        ("no own unknown", lambda x: jnp.roll(x, 1), np.zeros(70), True, "klu"),
+        ("own unknown", lambda x: x + jnp.append(x[1:], 0.0), np.zeros(70), True, "blocks"),
         ("wide", wide, None, False, None),
         ("wide", wide, None, True, "klu"),
-        ("a matrix", lambda x: x, np.eye(60), True, None),
+        ("a matrix", lambda x: x, np.eye(70), True, None),
         ("everything", lambda x: x * jnp.sum(x), None, True, None),
     ],
 )
 def test_choice(monkeypatch, name, function, mass, klu, expected):
     monkeypatch.setattr(sparsity, "has_klu", lambda dtype: klu)
-    x = jnp.ones(10 if name == "few unknowns" else 60)
+    x = jnp.ones(10 if name == "few unknowns" else 70)
     massless = None if mass is None else np.asarray(mass) == 0
     mass = None if mass is None else jnp.asarray(mass)
     found = sparsity.choose_sparsity("auto", function, x, mass, massless)
@@ -243,11 +243,11 @@ def test_refusals(monkeypatch):
     monkeypatch.setattr(sparsity, "has_klu", lambda dtype: False)
     with pytest.raises(ValueError, match="`structure` must be 'auto', 'dense' or 'sparse'"):
         sparsity.check_structure("band")
-    x = jnp.ones(60)
-    with pytest.raises(ValueError, match="most of the 60 equations of `terms` depend on most"):
+    x = jnp.ones(70)
+    with pytest.raises(ValueError, match="most of the 70 equations of `terms` depend on most"):
         sparsity.choose_sparsity("sparse", lambda x: x * jnp.sum(x), x, None)
     with pytest.raises(ValueError, match="structurally singular: however the unknowns"):
-        sparsity.choose_sparsity("sparse", lambda x: x.at[0].set(x[1]), x, x, np.ones(60, bool))
+        sparsity.choose_sparsity("sparse", lambda x: x.at[0].set(x[1]), x, x, np.ones(70, bool))
     with pytest.raises(ValueError, match=r"Install klujax .*manifold_jax\[sparse\]"):
         sparsity.choose_sparsity("sparse", wide, x, None)
 
