@@ -162,7 +162,7 @@ def test_a_batch_with_exchanges_of_rows(monkeypatch):
     ends, factors = jnp.asarray([0.1, 0.3]), jnp.asarray([1.0, 1.5])
 
     def along(structure, factor, t1):
-        run = lambda factor: end(structure, filters(32, shift=1), factor * ARGS, t1)[0]
+        run = lambda factor: end(structure, filters(64, shift=1), factor * ARGS, t1)[0]
         return jax.value_and_grad(run)(factor)
 
     batch = jax.jit(jax.vmap(lambda f, t1: along("auto", f, t1)))(factors, ends)
@@ -213,7 +213,7 @@ def test_masses_that_are_not_known():
 
 def wide(x):
     """Each equation with five random unknowns."""
-    return jnp.sum(x[np.random.default_rng(0).integers(70, size=(5, 70))], axis=0)
+    return jnp.sum(x[np.random.default_rng(0).integers(x.size, size=(5, x.size))], axis=0)
 
 
 @pytest.mark.parametrize(
@@ -221,18 +221,19 @@ def wide(x):
     [
         ("few unknowns", lambda x: jnp.roll(x[:10], 1), None, True, None),
         ("neighbours", lambda x: jnp.diff(x, append=0.0), None, False, "blocks"),
-        ("no own unknown", lambda x: jnp.roll(x, 1), np.zeros(70), False, None),
-        ("no own unknown", lambda x: jnp.roll(x, 1), np.zeros(70), True, "klu"),
-        ("own unknown", lambda x: x + jnp.append(x[1:], 0.0), np.zeros(70), True, "blocks"),
+        ("no own unknown", lambda x: jnp.roll(x, 1), np.zeros(130), False, None),
+        ("no own unknown", lambda x: jnp.roll(x, 1), np.zeros(130), True, "klu"),
+        ("few for KLU", lambda x: jnp.roll(x, 1), np.zeros(70), True, None),
+        ("own unknown", lambda x: x + jnp.append(x[1:], 0.0), np.zeros(130), True, "blocks"),
         ("wide", wide, None, False, None),
         ("wide", wide, None, True, "klu"),
-        ("a matrix", lambda x: x, np.eye(70), True, None),
+        ("a matrix", lambda x: x, np.eye(130), True, None),
         ("everything", lambda x: x * jnp.sum(x), None, True, None),
     ],
 )
 def test_choice(monkeypatch, name, function, mass, klu, expected):
     monkeypatch.setattr(sparsity, "has_klu", lambda dtype: klu)
-    x = jnp.ones(10 if name == "few unknowns" else 70)
+    x = jnp.ones({"few unknowns": 10, "few for KLU": 70}.get(name, 130))
     massless = None if mass is None else np.asarray(mass) == 0
     mass = None if mass is None else jnp.asarray(mass)
     found = sparsity.choose_sparsity("auto", function, x, mass, massless)

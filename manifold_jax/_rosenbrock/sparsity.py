@@ -16,6 +16,8 @@ from .._linalg.sparse import Choice, dependence, Method, program_of, SquarePatte
 # diffusion, in blocks of 2, then takes as long as with dense matrices (64), 0.61 of the time with 96, 1.3
 # times as long with 48; of a ladder, in blocks of 1, 0.45 (64), 0.53 (96) and 0.58 (48). jaxlib 0.10.2.
 SMALLEST = 64
+# The same for KLU: 1.7 and 1.4 times as long with 100 unknowns, 0.4 and 0.1 with 150.
+SMALLEST_KLU = 128
 # The largest number of colors as a part of the number of unknowns.
 _MOST_COLORS = 1 / 3
 # The largest width of blocks, as a part of the number of unknowns, for which they are eliminated.
@@ -76,7 +78,7 @@ def choose_sparsity(
     needs_no_exchanges = is_regular or len(pattern.on_diagonal) == n
     if narrow and (needs_no_exchanges or (choice == "sparse" and not with_klu)):
         return Sparsity(pattern, "blocks")
-    if with_klu:
+    if with_klu and (choice == "sparse" or n >= SMALLEST_KLU):
         return Sparsity(pattern, "klu")
     if choice == "sparse":
         raise ValueError(_NO_LIBRARY.format(width=pattern.block_order.width))
