@@ -24,6 +24,8 @@ def linearize_sparse(
     t: RealScalarLike,
     x: Float[Array, " n"],
 ) -> LinearizedEquations:
+    """Linearize at one time and state. Not finite where the index is above 1, or where combinations of
+    rows of the mass vanish and not rows themselves."""
     pattern, method = sparsity
     f, M = field(t, x), SparseMatrix.of_mass(mass, pattern)
     t = jnp.asarray(t, jnp.result_type(float, t))

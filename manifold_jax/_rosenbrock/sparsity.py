@@ -63,15 +63,10 @@ def choose_sparsity(
         if choice == "sparse":
             raise ValueError(_SINGULAR)
         return None
-    if (
-        choice == "auto"
-        and mass is not None
-        and massless is None
-        and not _has_diagonal(function, x)
-    ):
-        return (
-            None  # entries that may be zero or not: dense exchanges of rows do not depend on that
-        )
+    is_unknown = mass is not None and massless is None
+    if choice == "auto" and is_unknown and not _has_diagonal(function, x):
+        # Entries of the mass may be zero or not: exchanges of rows of dense matrices find out.
+        return None
     with_klu = has_klu(x.dtype)
     narrow = pattern.block_order.width <= _WIDEST * n
     is_regular = mass is None or (massless is not None and not massless.any())
