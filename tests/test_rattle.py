@@ -195,12 +195,6 @@ def test_bad_input(as_a_user_meets_it):
         mj.rattle(PENDULUM.system, order=3)
     with pytest.raises(ValueError, match="has constraints on velocities"):
         mj.rattle(mj.problems.rolling_disc().system)
-    crank = mj.problems.slider_crank()
-    with pytest.raises(ValueError, match="depends on the velocities"):
-        solve(crank, 2, 1.0, 0.01)
-    walker = mj.problems.compass_gait()
-    with pytest.raises(ValueError, match="masses of `system` depend on the positions"):
-        solve(walker, 2, 1.0, 0.01)
     with pytest.raises(Exception, match="step size"):
         mj.diffeqsolve(
             PENDULUM.terms,

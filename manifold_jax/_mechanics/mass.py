@@ -70,6 +70,7 @@ class Mass(eqx.Module):
 class InvertedBlocks(eqx.Module):
     """A nonsingular mass matrix of blocks with known inverses, in the place of the matrix."""
 
+    matrix: Float[Array, "b d d"]
     inverse: Float[Array, "b d d"]
     symmetric: BoolScalar
     positive: BoolScalar

@@ -42,10 +42,15 @@ def rattle(system: MechanicalSystem, *, order: Order = 2) -> RATTLE:
     **Arguments:**
 
     - `system`: that of the terms that are solved. Steps are made from its masses, forces and constraints and do
-        not evaluate the `terms`: a force that is in these alone has no effect. With constant masses,
-        forces that depend on time and positions only, and constraints on positions; all of them may
-        depend on `args`.
+        not evaluate the `terms`: a force that is in these alone has no effect. Its constraints are on
+        positions; all may depend on `args`.
     - `order`: 2, or compositions of such steps of order 4 (five of them, Suzuki) or 6 (nine, Kahan & Li).
+
+    Where masses depend on positions, or forces on velocities (bodies in space, whose attitude is a unit
+    quaternion; [`MechanicalSystem.from_lagrangian`][]), the steps are those of the variational integrator that
+    RATTLE is for constant masses, for rigid bodies a Lie group method. They are implicit, at several times the
+    cost, and symplectic if all forces on velocities come from the masses, as gyroscopic ones do; with friction
+    or drives they are of the same order and symmetric. A step is to be short beside a turn of a body.
 
     Rounding errors of positions and velocities are carried from step to step (compensated summation), in
     both precisions. States at the ends of steps are on the manifold to a few units of rounding.
@@ -58,12 +63,13 @@ def rattle(system: MechanicalSystem, *, order: Order = 2) -> RATTLE:
     **Raises:**
 
     `TypeError` for another system, `ValueError` for another order or constraints on velocities; when it is
-    solved, `ValueError` for forces that depend on velocities and masses that depend on positions.
+    solved, `ValueError` for implicit steps with `redundant=True`.
 
     Prefer an explicit method of high order for short times at tight tolerances.
 
     Sources: Andersen, J. Comput. Phys. 52 (1983) 24-34; Hairer, Lubich & Wanner, Geometric Numerical
-    Integration (2006), sections VII.1.4, V.3 and VIII.5.
+    Integration (2006), sections VII.1.4, V.3 and VIII.5; Wendlandt & Marsden, Physica D 106 (1997) 223-246
+    (rigid bodies); Marsden & West, Acta Numerica 10 (2001) 357-514.
     """
     if not isinstance(system, MechanicalSystem):
         raise TypeError(

@@ -12,43 +12,17 @@ import numpy as np
 from diffrax import RESULTS
 from jaxtyping import Array, Float
 
-from .._base.closure import convert_closure
 from .._base.compat import nonlinear_failure, time_direction
 from .._base.compensated import Compensated
 from .._base.compositions import composed, Order
-from .._base.types import Args, BoolScalar, RealScalarLike, Y
-from .._constraint.correction import (
-    ConstraintNormals,
-    CorrectionEquations,
-    FactoredGram,
-    solve_correction,
-)
-from .._constraint.settings import NewtonProjection
+from .._base.types import Args, RealScalarLike, Y
 from .._jaxpr.incidence import incidence
-from .._linalg.rows import combine, directions_of
 from .hermite import MechanicalHermite
 from .kinematics import flat, Kinematics
 from .motion import flat_force
+from .separable_step import Point, SeparableStep
 from .system import MechanicalSystem
-
-
-class _Here(NamedTuple):
-    """What a step needs of its start, which is the end of the one before: accelerations without
-    constraints, and the constraints linearized."""
-
-    free: Float[Array, " k"]
-    factored: FactoredGram
-    usable: BoolScalar
-
-
-class _Point(NamedTuple):
-    """Where a step begins or ends: positions and velocities, and whether the steps so far succeeded."""
-
-    t: Array
-    x: Compensated
-    w: Compensated
-    here: _Here
-    success: BoolScalar
+from .variational_step import VariationalStep
 
 
 class Rests(NamedTuple):
@@ -96,18 +70,18 @@ class RATTLESteps(dfx.AbstractSolver):
         solver_state: Rests,
         made_jump,
     ) -> Any:
-        _check_separable(self.system, t0, y0, args)
         x, w = flat(y0)
         unravel = jfu.ravel_pytree(y0[0])[1]
         direction = jnp.asarray(time_direction(terms), x.dtype)
         length = jnp.asarray(t1 - t0, x.dtype) * direction
         t = jnp.asarray(t0, x.dtype) * direction
-        here = self._here(t, x, w, unravel, args)
+        step = self._second_order(t, y0, unravel, args)
+        here = step.at(t, x, w)
         rests = Compensated(x, solver_state.x), Compensated(w, solver_state.w)
-        start = _Point(t, *rests, here, here.usable)
+        start = Point(t, *rests, here, here.usable)
 
-        def advance(point: _Point, fraction: Any) -> _Point:
-            return self._step(point, fraction * length, unravel, args)
+        def advance(point: Point, fraction: Any) -> Point:
+            return step.made(point, fraction * length)
 
         end = composed(advance, start, self.composition, x.dtype)
         y1 = unravel(end.x.value), unravel(end.w.value)
@@ -115,41 +89,23 @@ class RATTLESteps(dfx.AbstractSolver):
         dense_info = dict(y0=y0, y1=y1, length=length)
         return y1, None, dense_info, Rests(end.x.rest, end.w.rest), result
 
-    def _here(self, t: Any, x: Any, w: Any, unravel: Callable, args: Args) -> _Here:
-        y = unravel(x), unravel(w)
-        kinematics = Kinematics.of(self.system, t, y, args)
-        J, _ = kinematics.rows()
-        mass = kinematics.mass(J)
-        normals = ConstraintNormals(J, directions_of(mass, J))
-        factored = FactoredGram.of(normals, self.system.redundant)
-        force = flat_force(self.system.force(t, *y, args), y[0], x)
-        return _Here(mass.solve(force), factored, mass.valid & factored.factorization.usable)
-
-    def _step(self, start: _Point, h: Any, unravel: Callable, args: Args) -> _Point:
-        """Make one step of second order."""
-        t, x, w, here, success = start
-        after = t + h
-        half = w.plus(0.5 * h * here.free)
-        free = x.moved(h, half).value
-        system, directions = self.system, here.factored.normals.directions
-        residual = Kinematics.of(system, t, (unravel(free), unravel(w.value)), args).position
-        residual = convert_closure(residual, after, free, args)
-        equations = CorrectionEquations(
-            residual, after, free, args, None, directions, system.redundant
-        )
-        root = solve_correction(equations, free, NewtonProjection(), False, here.factored)
-        half = half.plus(combine(jnp.where(root.success, root.z, 0), directions) / h)
-        x = x.moved(h, half)
-        there = self._here(after, x.value, w.value, unravel, args)
-        w = half.plus(0.5 * h * there.free)
-        kinematics = Kinematics.of(system, after, (unravel(x.value), unravel(w.value)), args)
-        impulse = there.factored.solve(kinematics.velocities())
-        w = w.plus(-combine(impulse, there.factored.normals.directions))
-        return _Point(after, x, w, there, success & root.success & there.usable)
+    def _second_order(
+        self, t: Array, y: Y, unravel: Callable, args: Args
+    ) -> SeparableStep | VariationalStep:
+        """Choose the step, while tracing, by what masses and forces depend on."""
+        if _is_separable(self.system, t, y, args):
+            return SeparableStep(self.system, unravel, args)
+        if self.system.redundant:
+            raise ValueError(
+                "`system` may have constraints that depend on each other, `redundant=True`, and masses that depend on the "
+                "positions or forces that depend on the velocities: `rattle` needs independent ones then. Leave the "
+                "dependent ones out (of an assembly by `without_dependent_equations()`)."
+            )
+        return VariationalStep(self.system, unravel, args)
 
 
-def _check_separable(system: MechanicalSystem, t: Any, y: Y, args: Args) -> None:
-    """Refuse, while tracing, masses that depend on the positions, and forces that depend on velocities."""
+def _is_separable(system: MechanicalSystem, t: Array, y: Y, args: Args) -> bool:
+    """Whether masses are constant, and forces do not depend on velocities."""
     here = Kinematics.of(system, t, y, args)
 
     def masses(x: Float[Array, " k"]) -> Array:
@@ -160,16 +116,7 @@ def _check_separable(system: MechanicalSystem, t: Any, y: Y, args: Args) -> None
         q, v = here.unravel(here.x), here.unravel(w)
         return flat_force(system.force(here.t, q, v, args), q, w)
 
-    if _depends(masses, here.x):
-        raise ValueError(
-            "The masses of `system` depend on the positions; RATTLE needs constant ones. Use Cartesian coordinates, or "
-            "`mj.Projected(diffrax.Dopri8(), system.constraint)`."
-        )
-    if _depends(forces, here.w):
-        raise ValueError(
-            "The `force` of `system` depends on the velocities; RATTLE needs forces of time and positions. Leave friction "
-            "and gyroscopic terms out, or use `mj.Projected(diffrax.Dopri8(), system.constraint)`."
-        )
+    return not (_depends(masses, here.x) or _depends(forces, here.w))
 
 
 def _depends(function: Callable, x: Float[Array, " k"]) -> bool:

@@ -197,16 +197,22 @@ class Bodies(eqx.Module):
         G = rates_matrix(p)
         inverse, positive = inverted(inertia)
         mean = jnp.trace(inertia, axis1=1, axis2=2) / 3
-        turning = compose(jnp.swapaxes(G, 1, 2), compose(inverse, G))
-        turning = turning + p[:, :, None] * p[:, None, :] / mean[:, None, None]
-        turning = turning / (4 * jnp.sum(p * p, axis=1) ** 2)[:, None, None]
-        moving = jnp.eye(3, dtype=p.dtype)[None] / self.mass[:, None, None]
-        blocks = jnp.pad(moving, ((0, 0), (0, 4), (0, 4))) + jnp.pad(
-            turning, ((0, 0), (3, 0), (3, 0))
-        )
+        mean, mass = mean[:, None, None], self.mass[:, None, None]
+        along = p[:, :, None] * p[:, None, :]
+
+        def blocks(mass: Any, turning: Any) -> Any:
+            """Return `diag(mass, turning)` for each body."""
+            moving = mass * jnp.eye(3, dtype=p.dtype)[None]
+            widths = ((0, 0), (0, 4), (0, 4)), ((0, 0), (3, 0), (3, 0))
+            return jnp.pad(moving, widths[0]) + jnp.pad(turning, widths[1])
+
+        turned = lambda inertia: compose(jnp.swapaxes(G, 1, 2), compose(inertia, G))
+        matrix = blocks(mass, 4 * (turned(inertia) + mean * along))
+        norm4 = (4 * jnp.sum(p * p, axis=1) ** 2)[:, None, None]
+        inverse = blocks(1 / mass, (turned(inverse) + along / mean) / norm4)
         asymmetry = jnp.max(jnp.abs(inertia - jnp.swapaxes(inertia, 1, 2)))
         symmetric = asymmetry <= 1e-6 * jnp.max(jnp.abs(inertia))
-        return InvertedBlocks(blocks, symmetric, positive & jnp.all(self.mass > 0))
+        return InvertedBlocks(matrix, inverse, symmetric, positive & jnp.all(self.mass > 0))
 
     def gyroscopic(self, q: Pose, v: Pose) -> Float[Array, "..."]:
         """Return `-8 G(p')^T I G(p) p'` of every quaternion; zeros in the plane."""
