@@ -52,6 +52,7 @@ from ._solver import (
     AbstractManifoldSolver as AbstractManifoldSolver,
     LocalCoordinates as LocalCoordinates,
     Projected as Projected,
+    Relaxation as Relaxation,
     Stabilized as Stabilized,
     StepFrame as StepFrame,
     SymmetricProjection as SymmetricProjection,

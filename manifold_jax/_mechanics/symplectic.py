@@ -47,7 +47,7 @@ def rattle(system: MechanicalSystem, *, order: Order = 2) -> RATTLE:
     - `order`: 2, or compositions of such steps of order 4 (five of them, Suzuki) or 6 (nine, Kahan & Li).
 
     Where masses depend on positions, or forces on velocities (bodies in space, whose attitude is a unit
-    quaternion; [`MechanicalSystem.from_lagrangian`][]), the steps are those of the variational integrator that
+    quaternion; most Lagrangians), the steps are those of the variational integrator that
     RATTLE is for constant masses, for rigid bodies a Lie group method. They are implicit, at several times the
     cost, and symplectic if all forces on velocities come from the masses, as gyroscopic ones do; with friction
     or drives they are of the same order and symmetric. A step is to be short beside a turn of a body.
