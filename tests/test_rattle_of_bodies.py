@@ -32,7 +32,6 @@ def solve(problem, order, t1, steps, args=None, **options):
     ("problem", "order", "steps"),
     [
         (TOP, 2, 200),
-        pytest.param(TOP, 4, 100, marks=pytest.mark.slow),
         pytest.param(TOP, 6, 50, marks=pytest.mark.slow),
         pytest.param(mj.problems.slider_crank(), 2, 200, marks=pytest.mark.slow),
     ],
