@@ -12,12 +12,10 @@ import optimistix as optx
 from diffrax import RESULTS
 
 from .._base.closure import convert_closure
-from .._base.compat import is_okay, nonlinear_failure
-from .._base.rejection import is_repeatable, rejecting
 from .._base.types import Args, BoolScalar, FloatScalar, RealScalarLike, Y
 from .._linalg.newton import root_of_step, without_derivative
 from .._linalg.rows import product
-from .._rosenbrock.mass_matrix_solver import AbstractMassMatrixSolver
+from .._rosenbrock.mass_matrix_solver import AbstractMassMatrixSolver, Attempt
 from .._rosenbrock.solver import RosenbrockInterpolation
 from .._rosenbrock.system import System, Vector
 from .iteration import size_in_tolerances, solve_stages
@@ -146,14 +144,8 @@ class RadauIIA5(AbstractMassMatrixSolver, dfx.AbstractImplicitSolver):
         step = without_derivative(self._solve(fixed, state, derivative))
         newton_step = StageEquations(system, x0).newton_step
         Z = root_of_step(convert_closure(newton_step, step.Z), step.Z)
-        ok = jnp.all(jnp.isfinite(step.error)) & jnp.all(jnp.isfinite(step.Z))
-        result = RESULTS.where(ok, RESULTS.successful, RESULTS.nonfinite)  # pyright: ignore[reportArgumentType]
-        failed = step.defined & ~step.solved | ~state.usable
-        result = RESULTS.where(failed, nonlinear_failure(), result)
-        # A smaller step does not help if the equations are not defined at its beginning.
-        repeatable = is_repeatable(t0, t1, state.first_step) & step.defined & state.usable
-        y1 = unravel(x0 + Z[2] + jnp.where(state.usable, 0.0, jnp.nan).astype(x0.dtype))
-        error = rejecting(unravel(step.error), is_okay(result), repeatable)
+        attempt = Attempt(x0 + Z[2], step.error, step.defined, step.solved)
+        y1, error, result = attempt.outcome(t0, t1, state, unravel)
         k1, k2 = constant(DENSE, Z) @ Z
         dense_info = dict(y0=y0, y1=y1, k=(unravel(k1), unravel(k2)))
         return y1, error, dense_info, self._after(system, state, step.Z), result

@@ -1,16 +1,20 @@
-"""What solvers share that know of mass matrices: what they refuse, and the check of the start."""
+"""What solvers share that know of mass matrices: what they refuse, the check of the start, and which steps are
+to be repeated."""
 
-from typing import Any
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import diffrax as dfx
 import equinox as eqx
 import jax.flatten_util as jfu
 import jax.numpy as jnp
 import jax.tree_util as jtu
+from diffrax import RESULTS
 from jaxtyping import Array, Float
 
-from .._base.compat import is_sde, undirected
-from .._base.types import BoolScalar, Y
+from .._base.compat import is_okay, is_sde, nonlinear_failure, undirected
+from .._base.rejection import is_repeatable, rejecting
+from .._base.types import BoolScalar, RealScalarLike, Y
 from .._constraint.checks import check_state
 from .._linalg.sparse import Choice
 from .algebraic import is_consistent
@@ -35,6 +39,30 @@ class AbstractMassMatrixSolver(dfx.AbstractAdaptiveSolver):
         start, derivative = system.at_start(x, structure)
         usable = is_consistent(x, start) if self.checks_start else jnp.asarray(True)
         return derivative if callable(system.mass.mass) else None, usable
+
+
+class Attempt(NamedTuple):
+    """The end of a step with its error estimate, whether the equations are defined where it begins, and
+    whether they could be solved."""
+
+    x1: Float[Array, " n"]
+    error: Float[Array, " n"]
+    defined: BoolScalar
+    solved: BoolScalar
+
+    def outcome(
+        self, t0: RealScalarLike, t1: RealScalarLike, state: Any, unravel: Callable
+    ) -> tuple[Y, Y, RESULTS]:
+        """Return the state at the end, the error estimate, infinite if the step is to be repeated with a
+        smaller one, and the result. `state` is that of the solver."""
+        finite = jnp.all(jnp.isfinite(self.x1)) & jnp.all(jnp.isfinite(self.error))
+        result = RESULTS.where(finite, RESULTS.successful, RESULTS.nonfinite)  # pyright: ignore[reportArgumentType]
+        failed = self.defined & ~self.solved | ~state.usable
+        result = RESULTS.where(failed, nonlinear_failure(), result)
+        # A smaller step does not help if the equations are not defined at its beginning.
+        repeatable = is_repeatable(t0, t1, state.first_step) & self.defined & state.usable
+        y1 = unravel(self.x1 + jnp.where(state.usable, 0.0, jnp.nan).astype(self.x1.dtype))
+        return y1, rejecting(unravel(self.error), is_okay(result), repeatable), result
 
 
 def _check_terms(terms: Any) -> None:

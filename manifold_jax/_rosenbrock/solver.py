@@ -11,12 +11,10 @@ import jax.tree_util as jtu
 from diffrax import RESULTS
 from jaxtyping import Array, Float
 
-from .._base.compat import is_okay, nonlinear_failure
-from .._base.rejection import is_repeatable, rejecting
 from .._base.types import Args, BoolScalar, FloatScalar, RealScalarLike, Y
 from .._linalg.pivoted import LARGEST_WRITTEN_OUT
 from .._linalg.sparse import Choice
-from .mass_matrix_solver import AbstractMassMatrixSolver
+from .mass_matrix_solver import AbstractMassMatrixSolver, Attempt
 from .sparsity import check_structure
 from .stages import rosenbrock_step
 from .system import System
@@ -104,16 +102,8 @@ class AbstractRosenbrock(AbstractMassMatrixSolver):
         step = rosenbrock_step(
             self.tableau, system, x0, derivative, self.structure, self.largest_written_out
         )
-        finite = jnp.all(jnp.isfinite(step.x1)) & jnp.all(jnp.isfinite(step.error))
-        result = RESULTS.where(finite, RESULTS.successful, RESULTS.nonfinite)  # pyright: ignore[reportArgumentType]
-        singular = step.defined & ~step.nonsingular | ~solver_state.usable
-        result = RESULTS.where(singular, nonlinear_failure(), result)
-        # A smaller step does not help if the equations are not defined at its beginning.
-        repeatable = is_repeatable(t0, t1, solver_state.first_step)
-        repeatable &= step.defined & solver_state.usable
-        usable = jnp.where(solver_state.usable, 0.0, jnp.nan).astype(x0.dtype)
-        y1 = unravel(step.x1 + usable)
-        error = rejecting(unravel(step.error), is_okay(result), repeatable)
+        attempt = Attempt(step.x1, step.error, step.defined, step.nonsingular)
+        y1, error, result = attempt.outcome(t0, t1, solver_state, unravel)
         dense_info = dict(y0=y0, y1=y1, k=tuple(unravel(k) for k in step.dense))
         state = RosenbrockState(solver_state.first_step, step.derivative, solver_state.usable)
         return y1, error, dense_info, state, result
