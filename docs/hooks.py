@@ -2,6 +2,7 @@
 repository, and short names in cross references."""
 
 import base64
+import itertools
 import json
 import re
 from html import unescape
@@ -12,6 +13,7 @@ from xml.etree.ElementTree import Element, SubElement
 from latex2mathml.converter import convert
 from markdown import Extension, Markdown
 from markdown.blockprocessors import BlockProcessor
+from markdown.extensions.toc import slugify
 from markdown.inlinepatterns import InlineProcessor
 from mkdocs.plugins import event_priority
 from mkdocs.structure.files import File, Files
@@ -30,6 +32,7 @@ _TEXT_CELL = re.compile(r'<div class="[^"]*jp-RenderedMarkdown.*?</div>', re.DOT
 _FORMULA = re.compile(r"\$\$(.+?)\$\$|\$([^$]+)\$", re.DOTALL)
 # Links come first, so that an image within one stays as it is.
 _IMAGE = re.compile(r'<a\b.*?</a>|<img\b[^>]*?\bsrc="([^"]+)"[^>]*>', re.DOTALL)
+_DATA = re.compile(r'src="data:image/png;base64,[^"]*"')
 _OBJECT = re.compile(r"^::: manifold_jax\.([\w.]+)$", re.MULTILINE)
 
 
@@ -45,24 +48,41 @@ def on_files(files: Files, config: Any) -> Files:
             uri = f"{name}/{path.relative_to(folder).as_posix()}"
             files.append(File(uri, str(folder.parent), config.site_dir, config.use_directory_urls))
     for path in sorted((ROOT / "notebooks").glob("*.ipynb")):
-        if picture := _last_picture(path):
-            uri = f"notebooks/{path.stem}.png"
-            files.append(File.generated(config, uri, content=picture))
-    for uri, path in PAGES.items():
-        files.append(File.generated(config, uri, content=_linked(path.read_text(), files)))
+        pictures = _pictures(path)
+        names = [f"{path.stem}-{number}" for number in range(len(pictures))]
+        # Other pages show the last one.
+        for name, picture in zip([*names, path.stem], pictures + pictures[-1:]):
+            files.append(File.generated(config, f"notebooks/{name}.png", content=picture))
+    pages = {uri: path.read_text() for uri, path in PAGES.items()}
+    pages |= _by_question(pages["benchmarks.md"])
+    generated = [File.generated(config, uri, content="") for uri in pages]
+    for file in generated:
+        files.append(file)
+    for file in generated:
+        file.content_string = _linked(pages[file.src_uri], files)
     return files
 
 
-def _last_picture(notebook: Path) -> bytes | None:
-    """For pages that show what is in a notebook."""
+def _pictures(notebook: Path) -> list[bytes]:
     cells = json.loads(notebook.read_text())["cells"]
     shown = [output.get("data", {}) for cell in cells for output in cell.get("outputs", ())]
-    pictures = ["".join(data["image/png"]) for data in shown if "image/png" in data]
-    return base64.b64decode(pictures[-1]) if pictures else None
+    return [base64.b64decode("".join(data["image/png"])) for data in shown if "image/png" in data]
+
+
+def _by_question(text: str) -> dict[str, str]:
+    """Each section of the benchmarks but the last, the method, becomes a page of its own."""
+    overview, *sections, method = re.split(r"^(?=## )", text, flags=re.MULTILINE)
+    pages = {}
+    for section in sections:
+        name = slugify(section.splitlines()[0], "-")
+        pages[f"benchmarks-{name}.md"] = re.sub(r"^#(?=#)", "", section, flags=re.MULTILINE)
+        overview = overview.replace(f"(#{name})", f"(benchmarks-{name}.md)")
+    return pages | {"benchmarks.md": overview + method}
 
 
 def _linked(text: str, files: Files) -> str:
     """Links to what is in the repository alone become text."""
+    text = text.replace("](../docs/pages/", "](")
     is_here = lambda target: "://" in target or files.get_file_from_path(target) is not None
     return _LINK.sub(lambda m: m[0] if is_here(m[2]) else m[1], text)
 
@@ -82,11 +102,14 @@ def _with_anchors(match: re.Match[str]) -> str:
 def on_page_content(html: str, page: Any, **_: Any) -> str:
     """Images become links to their files. Of notebooks: formulas and links as on other pages, and without
     the scripts that would load MathJax and Mermaid from elsewhere."""
-    if not page.file.src_uri.endswith(".ipynb"):
-        return _IMAGE.sub(_enlargeable, html)
-    html = re.sub(r"<script\b.*?</script>", "", html, flags=re.DOTALL)
-    html = _PAGE.sub(r'href="../\1.html', html)
-    return _TEXT_CELL.sub(lambda text: _FORMULA.sub(_formula, text[0]), html)
+    if page.file.src_uri.endswith(".ipynb"):
+        html = re.sub(r"<script\b.*?</script>", "", html, flags=re.DOTALL)
+        html = _PAGE.sub(r'href="../\1.html', html)
+        html = _TEXT_CELL.sub(lambda text: _FORMULA.sub(_formula, text[0]), html)
+        number = itertools.count()
+        name = Path(page.file.src_uri).stem
+        html = _DATA.sub(lambda _: f'src="{name}-{next(number)}.png"', html)
+    return _IMAGE.sub(_enlargeable, html)
 
 
 def _enlargeable(match: re.Match[str]) -> str:

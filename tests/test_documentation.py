@@ -10,7 +10,7 @@ from pathlib import Path
 
 import diffrax as dfx
 import pytest
-from documents import blocks_of, ROOT, run
+from documents import assert_printed, blocks_of, outputs_of, ROOT, run
 
 import manifold_jax as mj
 
@@ -56,17 +56,28 @@ def test_every_page_and_every_notebook_is_in_the_navigation():
         assert f" {page}\n" in navigation
 
 
+def texts_of(name):
+    """The docstrings of a public name and of its members."""
+    thing = attrgetter(name)(mj)
+    members = vars(thing).values() if isinstance(thing, type) else ()
+    return [x.__doc__ or "" for x in (thing, *members)]
+
+
+def test_docstrings_have_no_control_characters():
+    """As `\\b` and `\\t` of formulas become in strings that are not raw."""
+    for name in public_names():
+        assert re.findall(r"[\x00-\x09\x0b-\x1f\x7f].*", "\n".join(texts_of(name))) == [], name
+
+
 def test_cross_references_of_docstrings_name_something_public():
     """By the anchors that docs/hooks.py sets."""
     anchors = set(public_names())
     anchors |= {f"mj.{name}" for name in anchors}
     for name in public_names():
         thing = attrgetter(name)(mj)
-        members = vars(thing).values() if isinstance(thing, type) else ()
-        texts = [x.__doc__ or "" for x in (thing, *members)]
         near = {x.removeprefix("multibody.") for x in anchors if name.startswith("multibody.")}
         own = {f"{thing.__name__}.{x}" for x in vars(thing)} if isinstance(thing, type) else set()
-        for target in re.findall(r"\[`([\w.]+)`\]\[\]", "\n".join(texts)):
+        for target in re.findall(r"\[`([\w.]+)`\]\[\]", "\n".join(texts_of(name))):
             assert target in anchors | near | own, name
 
 
@@ -157,4 +168,7 @@ def test_examples_of_a_page_run_one_after_the_other(page, tmp_path, monkeypatch)
         script = "\n".join(blocks_of(page))
         subprocess.run([sys.executable, "-W", "error", "-c", script], check=True)
     else:
-        run(*blocks_of(page))
+        printed = []
+        run(*blocks_of(page), printed=printed)
+        for number, shown in outputs_of(page).items():
+            assert_printed(shown, printed[number])

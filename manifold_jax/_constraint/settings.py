@@ -38,9 +38,9 @@ class NewtonProjection(eqx.Module):
     - `metric`: the norm in which the correction is orthogonal. By default, `None`, the mass matrix for
         the constraint of a [`MechanicalSystem`][]; otherwise the identity, or `"error"` if `atol` is
         below the rounding of a number of size one, so that far smaller components count, too.
-        `"identity"` in any case; `"error"` for the norm of the step size controller, `w_j = 1 / (atol
-        + rtol |y_j|)^2`; or a pytree like `y` of positive weights `w_j`, large for components that
-        should hardly move.
+        `"identity"` in any case; `"error"` for the norm of the step size controller,
+        `w_j = 1 / (atol + rtol |y_j|)^2`; or a pytree like `y` of positive weights `w_j`, large for
+        components that should hardly move.
     - `max_steps`: the largest number of Newton iterations before the projection fails. 1 is a method of
         its own, post-stabilization: one Newton step per step of the solver, successful if it
         lowers the residual; states are then near the manifold (the square of the local error),

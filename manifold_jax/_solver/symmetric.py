@@ -144,7 +144,7 @@ class SymmetricProjection(AbstractStepsOnManifold):
     A step of length `h` of `y' = f(t, y)`, `g(t, y) = 0` leaves the manifold along its normals, makes a step
     of the implicit midpoint rule there, and comes back with the same multipliers:
 
-    $$\hat y_0 = y_0 + G(y_0)^T \mu, \quad \hat y_1 = \hat y_0 + h figl(t_{1/2}, 	frac12 (\hat y_0 + \hat y_1)igr),
+    $$\hat y_0 = y_0 + G(y_0)^T \mu, \quad \hat y_1 = \hat y_0 + h f\bigl(t_{1/2}, \tfrac12 (\hat y_0 + \hat y_1)\bigr),
     \quad y_1 = \hat y_1 + G(y_1)^T \mu, \quad g(t_1, y_1) = 0.$$
 
     Interchanging `y_0` and `y_1`, with `-h`, leaves these equations as they are; a projection at the end of the
