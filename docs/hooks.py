@@ -49,9 +49,9 @@ def on_files(files: Files, config: Any) -> Files:
             files.append(File(uri, str(folder.parent), config.site_dir, config.use_directory_urls))
     for path in sorted((ROOT / "notebooks").glob("*.ipynb")):
         pictures = _pictures(path)
-        names = [f"{path.stem}-{number}" for number in range(len(pictures))]
-        # Other pages show the last one.
-        for name, picture in zip([*names, path.stem], pictures + pictures[-1:]):
+        named = {f"{path.stem}-{number}": picture for number, picture in enumerate(pictures)}
+        named |= {path.stem: pictures[-1]} if pictures else {}  # for other pages
+        for name, picture in named.items():
             files.append(File.generated(config, f"notebooks/{name}.png", content=picture))
     pages = {uri: path.read_text() for uri, path in PAGES.items()}
     pages |= _by_question(pages["benchmarks.md"])

@@ -36,8 +36,7 @@ def outputs_of(path):
     for language, block in blocks:
         count += language == "python"
         if language == "text":
-            assert count >= 0 and count not in shown, block
-            shown[count] = block
+            assert shown.setdefault(count, block) is block
     return shown
 
 

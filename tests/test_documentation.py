@@ -89,7 +89,7 @@ def texts_of_the_source():
                 parts = [x.value if isinstance(x, ast.Constant) else "..." for x in node.values]
                 yield "".join(parts)
             elif isinstance(node, ast.Constant) and isinstance(node.value, str):
-                yield re.sub(r"\{\w*\}", "...", node.value)
+                yield re.sub(r"\{\w*(:[^{}]*)?\}", "...", node.value)
 
 
 def quoted_messages():
