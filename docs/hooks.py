@@ -33,6 +33,9 @@ _FORMULA = re.compile(r"\$\$(.+?)\$\$|\$([^$]+)\$", re.DOTALL)
 # Links come first, so that an image within one stays as it is.
 _IMAGE = re.compile(r'<a\b.*?</a>|<img\b[^>]*?\bsrc="([^"]+)"[^>]*>', re.DOTALL)
 _DATA = re.compile(r'src="data:image/png;base64,[^"]*"')
+_CELL = re.compile(r"<td\b.*?</td>", re.DOTALL)
+# Of tables; tags and code stay as they are.
+_NUMBER = re.compile(r"<code>.*?</code>|<[^>]*>|([\d.)]+e-\d+|\d+ \d{3})\b")
 _OBJECT = re.compile(r"^::: manifold_jax\.([\w.]+)$", re.MULTILINE)
 
 
@@ -109,7 +112,12 @@ def on_page_content(html: str, page: Any, **_: Any) -> str:
         number = itertools.count()
         name = Path(page.file.src_uri).stem
         html = _DATA.sub(lambda _: f'src="{name}-{next(number)}.png"', html)
+    html = _CELL.sub(lambda cell: _NUMBER.sub(_in_one_line, cell[0]), html)
     return _IMAGE.sub(_enlargeable, html)
+
+
+def _in_one_line(match: re.Match[str]) -> str:
+    return f'<span class="number">{match[1]}</span>' if match[1] else match[0]
 
 
 def _enlargeable(match: re.Match[str]) -> str:

@@ -73,7 +73,7 @@ def _fields(class_: griffe.Class) -> dict[str, griffe.Parameter]:
             )
         elif options.get("init") != "False":
             own = _BY_NAME if options.get("kw_only") == "True" else kind
-            default = options.get("default")
+            default = "..." if "default_factory" in options else options.get("default")
             fields[name] = griffe.Parameter(
                 name, annotation=member.annotation, kind=own, default=default
             )

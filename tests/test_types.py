@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from documents import blocks_of, ROOT
 
 import manifold_jax
 
@@ -55,13 +56,19 @@ WRONG = [
 ]
 
 
-def test_wrong_calls_are_errors_and_right_ones_are_not(tmp_path):
-    (tmp_path / "script.py").write_text("\n".join([SETUP, *RIGHT, *WRONG]))
+def errors_in(folder):
+    """Names of files and numbers of lines."""
     root = Path(manifold_jax.__file__).parents[1]
     settings = f'{{"typeCheckingMode": "basic", "extraPaths": ["{root}"]}}'
-    (tmp_path / "pyrightconfig.json").write_text(settings)
+    (folder / "pyrightconfig.json").write_text(settings)
     command = [Path(sys.executable).with_name("basedpyright"), "--pythonpath", sys.executable]
-    run = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
-    first = len(SETUP.splitlines()) + len(RIGHT) + 1
-    lines = {int(text.split(":")[1]) for text in run.stdout.splitlines() if " - error: " in text}
-    assert lines == set(range(first + 1, first + 1 + len(WRONG))), run.stdout
+    run = subprocess.run(command, cwd=folder, capture_output=True, text=True)
+    errors = [text.split(":")[:2] for text in run.stdout.splitlines() if " - error: " in text]
+    return {(Path(name.strip()).name, int(line)) for name, line in errors}
+
+
+def test_wrong_calls_are_errors_and_right_ones_and_those_of_the_readme_are_not(tmp_path):
+    (tmp_path / "script.py").write_text("\n".join([SETUP, *RIGHT, *WRONG]))
+    (tmp_path / "readme.py").write_text("\n".join(blocks_of(ROOT / "README.md")))
+    first = len(SETUP.splitlines()) + len(RIGHT) + 2
+    assert errors_in(tmp_path) == {("script.py", first + i) for i in range(len(WRONG))}

@@ -35,7 +35,8 @@ def impact(
 
     ```python
     stop = mj.impact(system, gap=lambda t, q, args: 1.2 - q[1], restitution=0.6)
-    sol = mj.diffeqsolve(system.terms, mj.Projected(dfx.Tsit5(), system.constraint), ..., resets=(stop,))
+    hook = mj.Projected(dfx.Tsit5(), system.constraint)
+    sol = mj.diffeqsolve(system.terms, hook, 0.0, 1.0, None, y0, ..., resets=(stop,))
     ```
 
     **Arguments:**

@@ -46,7 +46,8 @@ def equilibrium(
 
     ```python
     hanging, _ = mj.equilibrium(system, q0, args)
-    frequencies = mj.linearize(system.terms, system.constraint, 0.0, (hanging, rest), args).eigenvalues()
+    near = mj.linearize(system.terms, system.constraint, 0.0, (hanging, rest), args)
+    frequencies = near.eigenvalues()
     ```
 
     Stable or not: the nearest root by a dogleg method is found, not the least energy. With derivatives by

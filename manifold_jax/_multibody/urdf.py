@@ -86,7 +86,7 @@ def read_urdf(
 
     ```yaml
     closed_loop: [['elbow_left', 'elbow_right']]  # links whose frames coincide
-    type: ['6d']                                  # '6d': a weld, '3d': only their origins, a ball joint
+    type: ['6d']                                  # a weld; '3d': a ball joint, only origins
     name_mot: ['shoulder_left', 'shoulder_right'] # joints with motors
     joint_name: ['ankle', 'knee']                 # joints of another type than in the URDF:
     joint_type: ['SPHERICAL', 'UJOINT_XY']        # or 'FIXED'; axes are those of the joint's frame
@@ -94,7 +94,7 @@ def read_urdf(
 
     Links that are welded together are one body, with the name of the heaviest one; links without mass
     between hinges become universal or ball joints. Of the equations of its joints as many are solved as are
-    independent, see [`Assembly`][].without_dependent_equations.
+    independent, see `Assembly.without_dependent_equations`.
 
     **Arguments:**
 

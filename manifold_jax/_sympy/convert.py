@@ -27,7 +27,8 @@ def from_sympy(method: Any, *, inputs: Mapping[Any, Any] | None = None) -> Symbo
     model = mj.from_sympy(kane)
     args = model.args({m: 1.0, g: 9.81})
     y0 = model.state({q1: 0.3, u3: -5.0}, args)
-    sol = mj.diffeqsolve(model.terms, mj.Projected(dfx.Tsit5(), model.constraint), 0.0, 1.0, None, y0, args, ...)
+    hook = mj.Projected(dfx.Tsit5(), model.constraint)
+    sol = mj.diffeqsolve(model.terms, hook, 0.0, 1.0, None, y0, args, ...)
     ```
 
     The state is `(q, u)`, arrays in the order of `method.q` and `method.u`. `args` is a dictionary with a number
