@@ -108,6 +108,9 @@ def on_page_content(html: str, page: Any, **_: Any) -> str:
     if page.file.src_uri.endswith(".ipynb"):
         html = re.sub(r"<script\b.*?</script>", "", html, flags=re.DOTALL)
         html = _PAGE.sub(r'href="../\1.html', html)
+        html = html.replace(
+            'class="anchor-link"', 'class="headerlink"'
+        )  # which the search leaves out
         html = _TEXT_CELL.sub(lambda text: _FORMULA.sub(_formula, text[0]), html)
         number = itertools.count()
         name = Path(page.file.src_uri).stem

@@ -86,6 +86,8 @@ from ._manifolds import Product as Product, Sphere as Sphere, Stiefel as Stiefel
 
 # isort: split
 from . import multibody as multibody, problems as problems
+from ._base.docstrings import unlink_docstrings as _unlink_docstrings
 
 
 __version__ = version("manifold_jax")
+_unlink_docstrings(globals(), vars(multibody), vars(problems))
