@@ -90,8 +90,11 @@ def _linked(text: str, files: Files) -> str:
     return _LINK.sub(lambda m: m[0] if is_here(m[2]) else m[1], text)
 
 
-def on_page_markdown(markdown: str, **_: Any) -> str:
-    """Docstrings refer to `[Projected][]` or `[mj.Projected][]`: anchors with these names."""
+def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
+    """Docstrings refer to `[Projected][]` or `[mj.Projected][]`: anchors with these names. Answers to
+    questions are the first that the search finds."""
+    if page.file.src_uri == "questions.md":
+        page.meta["search"] = {"boost": 4}
     return _OBJECT.sub(_with_anchors, markdown)
 
 
