@@ -15,7 +15,7 @@ from .._base.closure import convert_closure
 from .._base.types import Args, BoolScalar, FloatScalar, RealScalarLike, Y
 from .._linalg.newton import root_of_step, without_derivative
 from .._linalg.rows import product
-from .._rosenbrock.mass_matrix_solver import AbstractMassMatrixSolver, Attempt
+from .._rosenbrock.mass_matrix_solver import AbstractMassMatrixSolver, AttemptedStep
 from .._rosenbrock.solver import RosenbrockInterpolation
 from .._rosenbrock.system import System, Vector
 from .iteration import size_in_tolerances, solve_stages
@@ -144,8 +144,8 @@ class RadauIIA5(AbstractMassMatrixSolver, dfx.AbstractImplicitSolver):
         step = without_derivative(self._solve(fixed, state, derivative))
         newton_step = StageEquations(system, x0).newton_step
         Z = root_of_step(convert_closure(newton_step, step.Z), step.Z)
-        attempt = Attempt(x0 + Z[2], step.error, step.defined, step.solved)
-        y1, error, result = attempt.outcome(t0, t1, state, unravel)
+        attempted = AttemptedStep(x0 + Z[2], step.error, step.defined, step.solved)
+        y1, error, result = attempted.outcome(t0, t1, state, unravel)
         k1, k2 = constant(DENSE, Z) @ Z
         dense_info = dict(y0=y0, y1=y1, k=(unravel(k1), unravel(k2)))
         return y1, error, dense_info, self._after(system, state, step.Z), result

@@ -41,7 +41,7 @@ class AbstractMassMatrixSolver(dfx.AbstractAdaptiveSolver):
         return derivative if callable(system.mass.mass) else None, usable
 
 
-class Attempt(NamedTuple):
+class AttemptedStep(NamedTuple):
     """The end of a step with its error estimate, whether the equations are defined where it begins, and
     whether they could be solved."""
 

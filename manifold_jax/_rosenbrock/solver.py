@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 from .._base.types import Args, BoolScalar, FloatScalar, RealScalarLike, Y
 from .._linalg.pivoted import LARGEST_WRITTEN_OUT
 from .._linalg.sparse import Choice
-from .mass_matrix_solver import AbstractMassMatrixSolver, Attempt
+from .mass_matrix_solver import AbstractMassMatrixSolver, AttemptedStep
 from .sparsity import check_structure
 from .stages import rosenbrock_step
 from .system import System
@@ -102,8 +102,8 @@ class AbstractRosenbrock(AbstractMassMatrixSolver):
         step = rosenbrock_step(
             self.tableau, system, x0, derivative, self.structure, self.largest_written_out
         )
-        attempt = Attempt(step.x1, step.error, step.defined, step.nonsingular)
-        y1, error, result = attempt.outcome(t0, t1, solver_state, unravel)
+        attempted = AttemptedStep(step.x1, step.error, step.defined, step.nonsingular)
+        y1, error, result = attempted.outcome(t0, t1, solver_state, unravel)
         dense_info = dict(y0=y0, y1=y1, k=tuple(unravel(k) for k in step.dense))
         state = RosenbrockState(solver_state.first_step, step.derivative, solver_state.usable)
         return y1, error, dense_info, state, result
