@@ -137,11 +137,24 @@ def test_a_batch_is_one_by_one():
         jax.tree.map(
             lambda a, b, i=i: np.testing.assert_allclose(a[i], b, atol=1e-13), together, alone
         )
-    parts = PENDULUM.terms, mj.rattle(PENDULUM.system), 0.0, 1.0, 0.01, starts, PENDULUM.args
-    ensemble = mj.solve_ensemble(*parts, args_axes=None, max_steps=128)
+
+    def in_lanes(args):
+        parts = PENDULUM.terms, mj.rattle(PENDULUM.system), 0.0, 1.0, 0.01, starts, args
+        return mj.solve_ensemble(*parts, args_axes=None, max_steps=128)
+
+    ensemble = in_lanes(PENDULUM.args)
+    assert ensemble.execution == "in lanes"
     assert not ensemble.failed.any()
     jax.tree.map(
         lambda a, b: np.testing.assert_allclose(a[:, -1], b, atol=1e-13), ensemble.ys, together
+    )
+    lanes = jax.grad(lambda args: jnp.sum(in_lanes(args).ys[0][:, -1, 0]))(PENDULUM.args)
+    batch = lambda args: jax.vmap(
+        lambda y0: at_end(solve(PENDULUM, 2, 1.0, 0.01, args, y0=y0, max_steps=128))[0][0]
+    )(starts)
+    mapped = jax.jit(jax.grad(lambda args: jnp.sum(batch(args))))(PENDULUM.args)
+    jax.tree.map(
+        lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-11, atol=1e-13), lanes, mapped
     )
 
 

@@ -8,6 +8,7 @@ import jax.tree_util as jtu
 
 from ..._adjoint import StepReplayAdjoint
 from ..._jaxpr.lane_arrays import NotScalarError
+from ..._mechanics.symplectic_steps import RATTLESteps
 from ..._rosenbrock import AbstractRosenbrock
 from ..._solver.base import AbstractManifoldSolver
 from ..._solver.step.explicit import is_unrollable
@@ -55,7 +56,9 @@ def _obstacle(inputs: Inputs) -> str | None:
         size = sum(jnp.size(leaf) for leaf in jtu.tree_leaves(one.y0))
         if size > LARGEST_STIFF:
             return f"more than {LARGEST_STIFF} unknowns of a stiff system"
-    elif not is_unrollable(solver.inner, equations.terms, one.t0, one.t1, one.y0, one.args):
+    elif not isinstance(solver.inner, RATTLESteps) and not is_unrollable(
+        solver.inner, equations.terms, one.t0, one.t1, one.y0, one.args
+    ):
         return f"{type(solver.inner).__name__} is not an explicit Runge-Kutta method"
     if equations.event is not None:
         return "an `event` is searched for"
