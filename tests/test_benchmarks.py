@@ -26,7 +26,7 @@ PROGRAMS = {
     if "\ndef main(" in (ROOT / f"{module.replace('.', '/')}.py").read_text()
 }
 # Of others, and not needed for anything else.
-PEERS = ("casadi", "mujoco", "pinocchio", "pydiffsol", "sksundae", "yaml")
+PEERS = ("casadi", "jax_md", "mujoco", "pinocchio", "pydiffsol", "sksundae", "yaml")
 SMALLEST = {
     "benchmarks.dae_board.__main__": dict(problems="linear: generator", quick=True, repeats=1),
     "benchmarks.peers.approaches": dict(problems="pendulum", repeats=1, quick=True),

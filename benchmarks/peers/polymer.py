@@ -3,7 +3,8 @@
 `python -m benchmarks.peers.polymer --json benchmarks/results/polymer.json --plot benchmarks/results/polymer.png`
 
 Time of the process for one unit of simulated time, on one core; error of the state after that time;
-energy and violation over a longer run. RATTLE is compiled by JAX (`benchmarks/peers/_rattle.py`).
+energy and violation over a longer run. RATTLE is `mj.rattle`, and as in molecular dynamics, compiled by JAX
+(`benchmarks/peers/_rattle.py`).
 """
 
 import time
@@ -111,6 +112,27 @@ def ours(task: Task, name: str, tolerances: Any, repeats: int) -> list[dict[str,
     return rows
 
 
+def by_mj_rattle(task: Task, steps: Any, repeats: int) -> list[dict[str, Any]]:
+    """RATTLE of this library, to round-off."""
+    problem = task.problem
+    solver = mj.rattle(problem.system)
+
+    def solve(step, t1, saveat):
+        parts = problem.terms, solver, 0.0, t1, step, task.y0, task.args
+        return mj.diffeqsolve(*parts, saveat=saveat, max_steps=None)
+
+    one = jax.jit(lambda step: solve(step, 1.0, dfx.SaveAt(t1=True)))
+    times = dfx.SaveAt(ts=jnp.linspace(0, task.long, int(task.long) + 1)[1:])
+    long = jax.jit(lambda step: solve(step, task.long, times).ys)
+    rows = []
+    for step in steps:
+        sol, ms = timed(lambda step=step: one(step), repeats)
+        end, number = jax.tree.map(lambda x: x[-1], sol.ys), int(sol.stats["num_steps"])
+        states = task.as_numpy(long(step))
+        rows.append(task.row("mj.rattle", step, end, ms, states, steps=number))
+    return rows
+
+
 def rattle(task: Task, name: str, step: float, repeats: int) -> dict[str, Any]:
     method, tolerance = RATTLE[name]
     chain = _rattle.Chain(1 / task.args.masses, task.args.lengths)
@@ -159,7 +181,7 @@ def write_figure(path: Path, rows: list[dict[str, Any]], long: float) -> None:
     figure, axes = plt.subplots(1, 3, figsize=(12, 4), layout="constrained")
     methods = list(dict.fromkeys(row["method"] for row in rows))
     for axis, (name, title) in zip(axes, titles.items(), strict=True):
-        for method, marker in zip(methods, "osv^D", strict=False):
+        for method, marker in zip(methods, "osPv^D", strict=False):
             own = [row for row in rows if row["method"] == method]
             points = zip(*((row["ms_per_unit"], row[name]) for row in own), strict=True)
             axis.loglog(*points, marker=marker, label=method)
@@ -167,7 +189,7 @@ def write_figure(path: Path, rows: list[dict[str, Any]], long: float) -> None:
         axis.title.set_fontsize(10)
         axis.grid(alpha=0.3)
     handles, labels = axes[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=5, fontsize=9)
+    figure.legend(handles, labels, loc="outside lower center", ncols=6, fontsize=9)
     figure.savefig(path, dpi=150)
 
 
@@ -185,6 +207,7 @@ def main(
     task = Task(bonds, long)
     of = lambda settings: settings[1:2] if quick else settings
     rows = [row for name in SOLVERS for row in ours(task, name, of(TOLERANCES), repeats)]
+    rows += by_mj_rattle(task, of(STEPS), repeats)
     rows += [rattle(task, name, step, repeats) for name in RATTLE for step in of(STEPS)]
     rows += [by_scipy(task, tolerance) for tolerance in of(TOLERANCES)]
     make_console().print(table(rows))
