@@ -172,6 +172,18 @@ def test_bodies_in_the_plane():
     assert abs(np.log2(errors[0] / errors[1]) - 2) < 0.2
 
 
+@pytest.mark.slow
+def test_sparse_constraints_are_as_dense_ones():
+    """Also in a composition, whose loop carries the structure of the rows."""
+    chain, ends = mj.problems.chain(), []
+    given = chain.system.mass_matrix.function, chain.system.holonomic, chain.system.force
+    for structure in ("sparse", "dense"):
+        system = mj.MechanicalSystem(*given, structure=structure)
+        parts = system.terms, mj.rattle(system, order=4), 0.0, 0.05, 0.01, chain.y0, chain.args
+        ends.append(at_end(mj.diffeqsolve(*parts, max_steps=8)))
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=0, atol=1e-13), *ends)
+
+
 def test_resets():
     """A rod that loses half of its velocity at the bottom: the event is where the solution has it."""
     bounce = mj.Reset(lambda t, y, args: y[0][0], lambda t, y, args: (y[0], -0.5 * y[1]))

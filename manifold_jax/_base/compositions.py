@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from typing import Any, Literal, TypeAlias, TypeVar
 
+import equinox as eqx
 import jax.lax as lax
 import jax.numpy as jnp
 
@@ -33,4 +34,11 @@ def composed(
     fractions = jnp.asarray(COMPOSITIONS[order], dtype)
     if fractions.size == 1:
         return advance(start, fractions[0])
-    return lax.scan(lambda state, fraction: (advance(state, fraction), None), start, fractions)[0]
+    # What is not an array, such as the structure of sparse constraints, is the same after each step.
+    arrays, rest = eqx.partition(start, eqx.is_array)
+
+    def body(arrays: Any, fraction: Any) -> tuple[Any, None]:
+        end = advance(eqx.combine(arrays, rest), fraction)
+        return eqx.filter(end, eqx.is_array), None
+
+    return eqx.combine(lax.scan(body, arrays, fractions)[0], rest)
