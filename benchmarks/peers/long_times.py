@@ -30,6 +30,7 @@ from ..tools.measure import (
     use_one_core,
     write_json,
 )
+from ._long_time_body import quaternion_top
 from ._long_time_molecule import molecule
 from ._long_time_picture import write_figure
 from ._long_time_planets import planet, solar_system
@@ -42,7 +43,7 @@ SAMPLES = 1000
 PARTS = 20
 TOLERANCE = 1e-8  # of SciPy
 QUANTITIES = ("energy", "angular momentum", "linear momentum")
-MECHANISMS = (pendulum, spherical_pendulum, chain, top, solar_system, molecule)
+MECHANISMS = (pendulum, spherical_pendulum, chain, top, quaternion_top, solar_system, molecule)
 IN_SINGLE_PRECISION = (pendulum, top)
 
 
