@@ -48,8 +48,8 @@ def rattle(system: MechanicalSystem, *, order: Order = 2) -> RATTLE:
 
     Where masses depend on positions, or forces on velocities (bodies in space, whose attitude is a unit
     quaternion; most Lagrangians), the steps are those of the variational integrator that
-    RATTLE is for constant masses, for rigid bodies a Lie group method. They are implicit, at several times the
-    cost, and symplectic if all forces on velocities come from the masses, as gyroscopic ones do; with friction
+    RATTLE is for constant masses, for rigid bodies a Lie group method. They are implicit, each factors a
+    matrix of `n + m` rows, and symplectic if all forces on velocities come from the masses, as gyroscopic ones do; with friction
     or drives they are of the same order and symmetric. A step is to be short beside a turn of a body.
 
     Rounding errors of positions and velocities are carried from step to step (compensated summation), in
