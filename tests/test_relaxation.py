@@ -103,6 +103,29 @@ def test_gradients():
         np.testing.assert_allclose(jnp.sum(reverse[name] * unit), slope, rtol=1e-8)
 
 
+@pytest.mark.slow
+def test_lanes_are_one_by_one():
+    """States, and gradients."""
+    starts = jax.tree.map(lambda x: jnp.stack([x, 1.1 * x]), START)
+    hook = mj.Relaxation(dfx.Tsit5(), mj.Invariants(energy, y0=START, args=ARGS))
+    parts = dfx.ODETerm(field), hook, 0.0, 1.0, 0.1
+
+    def in_lanes(stiffness):
+        args = ARGS | {"stiffness": stiffness}
+        return mj.solve_ensemble(*parts, starts, args, args_axes=None, max_steps=16)
+
+    def alone(stiffness, i):
+        args, y0 = ARGS | {"stiffness": stiffness}, jax.tree.map(lambda x: x[i], starts)
+        return mj.diffeqsolve(*parts, y0, args, max_steps=16).ys[0][-1, 0]
+
+    assert in_lanes(ARGS["stiffness"]).execution == "in lanes"
+    last = lambda stiffness: jnp.sum(in_lanes(stiffness).ys[0][:, -1, 0])
+    value, slope = jax.value_and_grad(last)(ARGS["stiffness"])
+    each = [jax.jit(jax.value_and_grad(alone))(ARGS["stiffness"], i) for i in range(2)]
+    np.testing.assert_allclose(value, sum(x for x, _ in each), rtol=1e-13)
+    np.testing.assert_allclose(slope, sum(x for _, x in each), rtol=1e-11)
+
+
 def test_bad_input():
     level = mj.Invariants(energy, y0=START, args=ARGS)
     with pytest.raises(TypeError, match="`solver` must be an instance"):

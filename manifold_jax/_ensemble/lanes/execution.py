@@ -8,9 +8,9 @@ import jax.tree_util as jtu
 
 from ..._adjoint import StepReplayAdjoint
 from ..._jaxpr.lane_arrays import NotScalarError
-from ..._mechanics.symplectic_steps import RATTLESteps
 from ..._rosenbrock import AbstractRosenbrock
 from ..._solver.base import AbstractManifoldSolver
+from ..._solver.on_manifold import AbstractStepsOnManifold
 from ..._solver.step.explicit import is_unrollable
 from ..._solver.terms import DirectedTerm
 from ..._solver.unconstrained import Unconstrained
@@ -56,7 +56,7 @@ def _obstacle(inputs: Inputs) -> str | None:
         size = sum(jnp.size(leaf) for leaf in jtu.tree_leaves(one.y0))
         if size > LARGEST_STIFF:
             return f"more than {LARGEST_STIFF} unknowns of a stiff system"
-    elif not isinstance(solver.inner, RATTLESteps) and not is_unrollable(
+    elif not isinstance(solver, AbstractStepsOnManifold) and not is_unrollable(
         solver.inner, equations.terms, one.t0, one.t1, one.y0, one.args
     ):
         return f"{type(solver.inner).__name__} is not an explicit Runge-Kutta method"
