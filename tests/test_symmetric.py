@@ -136,6 +136,14 @@ def test_a_batch_is_one_by_one():
     together = jax.jit(jax.vmap(one))(rates)
     for rate, row in zip(rates, together, strict=True):
         np.testing.assert_allclose(row, one(rate), atol=1e-14)
+    parts = dfx.ODETerm(breathing), mj.SymmetricProjection(CIRCLE), 0.0, 1.0, 0.1
+    starts, args = jnp.stack([exact(0.0)] * 3), ARGS | {"rate": rates}
+    axes = {"amplitude": None, "rate": 0}
+    ensemble = mj.solve_ensemble(*parts, starts, args, args_axes=axes, max_steps=16)
+    assert ensemble.execution == "in lanes"
+    for rate, row in zip(rates, ensemble.ys[:, -1], strict=True):
+        alone = breathe(2, 0.0, 1.0, 10, {**ARGS, "rate": rate}).ys[-1]
+        np.testing.assert_allclose(row, alone, atol=1e-14)
 
 
 @pytest.mark.slow

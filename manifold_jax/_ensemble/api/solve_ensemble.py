@@ -101,10 +101,10 @@ def solve_ensemble(
         the others are not affected.
 
     Explicit Runge-Kutta methods, in a hook or alone, [`rattle`][], [`SymmetricProjection`][] and [`Relaxation`][],
-    and [`Rodas5P`][] and [`Rodas3P`][] alone for up to eight unknowns, with constant steps or `diffrax.PIDController`, are advanced in lanes. Other solvers,
-    mass matrices, other controllers, events, resets and systems too large to be written out number by number are
-    solved by `diffeqsolve` under `jax.lax.map` in batches of `lanes`. `execution` of the solution says
-    which of the two was used, and why.
+    and [`Rodas5P`][] and [`Rodas3P`][] alone for up to eight unknowns, with constant steps or
+    `diffrax.PIDController`, are advanced in lanes. Other solvers, mass matrices, other controllers, events, resets
+    and systems too large to be written out number by number are solved by `diffeqsolve` under `jax.lax.map` in
+    batches of `lanes`. `execution` of the solution says which of the two was used, and why.
 
     **Returns:**
 
