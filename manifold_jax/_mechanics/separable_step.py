@@ -18,6 +18,7 @@ from .._constraint.correction import (
 from .._constraint.settings import NewtonProjection
 from .._linalg.rows import combine, directions_of
 from .kinematics import Kinematics
+from .mass import InvertedBlocks, Mass
 from .motion import flat_force
 from .system import MechanicalSystem
 
@@ -49,14 +50,9 @@ class SeparableStep(NamedTuple):
     args: Args
 
     def at(self, t: Any, x: Array, w: Array) -> _ExplicitStart:
-        kinematics = self._kinematics(t, x, w)
-        J, _ = kinematics.rows()
-        mass = kinematics.mass(J)
-        normals = ConstraintNormals(J, directions_of(mass, J))
-        factored = FactoredGram.of(normals, self.system.redundant)
-        force = flat_force(
-            self.system.force(t, self.unravel(x), self.unravel(w), self.args), self.unravel(x), x
-        )
+        mass, factored = linearized(self._kinematics(t, x, w))
+        q, v = self.unravel(x), self.unravel(w)
+        force = flat_force(self.system.force(t, q, v, self.args), q, x)
         return _ExplicitStart(
             mass.solve(force), factored, mass.valid & factored.factorization.usable
         )
@@ -82,6 +78,14 @@ class SeparableStep(NamedTuple):
 
     def _kinematics(self, t: Any, x: Array, w: Array) -> Kinematics:
         return Kinematics.of(self.system, t, (self.unravel(x), self.unravel(w)), self.args)
+
+
+def linearized(here: Kinematics) -> tuple[Mass | InvertedBlocks, FactoredGram]:
+    """Return the masses, and the constraints with their directions in the metric of these, factored."""
+    J, _ = here.rows()
+    mass = here.mass(J)
+    normals = ConstraintNormals(J, directions_of(mass, J))
+    return mass, FactoredGram.of(normals, here.system.redundant)
 
 
 def on_constraints(here: Kinematics, w: Compensated, factored: FactoredGram) -> Compensated:

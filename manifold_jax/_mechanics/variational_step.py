@@ -10,15 +10,15 @@ from jaxtyping import Array, Float
 
 from .._base.closure import convert_closure
 from .._base.types import Args, BoolScalar
-from .._constraint.correction import ConstraintNormals, FactoredGram
+from .._constraint.correction import FactoredGram
 from .._constraint.residual import row_scale
 from .._constraint.settings import NewtonProjection
 from .._linalg.newton import chord, implicit_root, SquareSystem, without_derivative
-from .._linalg.rows import combine, directions_of, product
+from .._linalg.rows import combine, product
 from .kinematics import Kinematics
 from .mass import InvertedBlocks, Mass
 from .motion import flat_force
-from .separable_step import on_constraints, Point
+from .separable_step import linearized, on_constraints, Point
 from .system import MechanicalSystem
 
 
@@ -54,10 +54,7 @@ class VariationalStep(NamedTuple):
     args: Args
 
     def at(self, t: Any, x: Array, w: Array) -> _ImplicitStart:
-        kinematics = self._kinematics(t, x, w)
-        J, _ = kinematics.rows()
-        mass = kinematics.mass(J)
-        factored = FactoredGram.of(ConstraintNormals(J, directions_of(mass, J)), False)
+        mass, factored = linearized(self._kinematics(t, x, w))
         return _ImplicitStart(mass, factored, mass.valid & factored.factorization.usable)
 
     def made(self, start: Point, h: Any) -> Point:

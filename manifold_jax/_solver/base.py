@@ -20,6 +20,7 @@ from .interpolation import CorrectedInterpolationFactory
 from .step.execution import AbstractExecution, execution_of
 from .step.frame import StepFrame
 from .step.hook_state import conclude, HookState
+from .terms import has_several
 
 
 # One-step methods that keep no past values of y. Others (leapfrog, reversible) carry a
@@ -258,3 +259,13 @@ def check_no_mass_matrix(terms: Any, hook: str) -> None:
             f"`terms` is an `mj.MassMatrixTerm`, but `mj.{hook}` needs y' itself. Use `mj.Projected(mj.Rodas5P(), "
             "constraint)`, or for a regular mass matrix solve for y' in the vector field of a `diffrax.ODETerm`."
         )
+
+
+def check_one_equation(terms: Any, hook: str) -> None:
+    """Refuse noise, sums of terms and mass matrices."""
+    if is_sde(terms) or has_several(terms):
+        raise ValueError(
+            "`terms` must be one ordinary differential equation, a `diffrax.ODETerm`. Use "
+            "`mj.Projected(solver, constraint)`."
+        )
+    check_no_mass_matrix(terms, hook)

@@ -10,18 +10,17 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from diffrax import RESULTS
 
-from .._base.compat import is_sde, nonlinear_failure, time_direction
+from .._base.compat import nonlinear_failure, time_direction
 from .._base.types import Args, RealScalarLike, Y
 from .._constraint.constraint import AbstractConstraint
 from .._constraint.correction import equations_of, solve_correction
 from .._constraint.projection_info import ProjectionInfo
 from .._constraint.settings import NewtonProjection
-from .base import check_hook_arguments, check_no_mass_matrix
+from .base import check_hook_arguments, check_one_equation
 from .interpolation import CorrectedInterpolation
 from .on_manifold import AbstractStepsOnManifold
 from .step.execution import ExplicitStep
 from .step.frame import StepFrame
-from .terms import has_several
 
 
 class RelaxedSteps(dfx.AbstractSolver):
@@ -156,10 +155,5 @@ class Relaxation(AbstractStepsOnManifold):
         self.state_of_coordinates = None
 
     def prepare_terms(self, terms: Any) -> Any:
-        if is_sde(terms) or has_several(terms):
-            raise ValueError(
-                "`terms` must be one ordinary differential equation, a `diffrax.ODETerm`. Use "
-                "`mj.Projected(solver, constraint)`."
-            )
-        check_no_mass_matrix(terms, "Relaxation")
+        check_one_equation(terms, "Relaxation")
         return terms

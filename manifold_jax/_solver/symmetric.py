@@ -12,7 +12,7 @@ from diffrax import RESULTS
 from jaxtyping import Array, Float
 
 from .._base.closure import convert_closure
-from .._base.compat import is_sde, nonlinear_failure, time_direction
+from .._base.compat import nonlinear_failure, time_direction
 from .._base.compensated import Compensated
 from .._base.compositions import check_order, composed, Order
 from .._base.types import Args, BoolScalar, FloatScalar, RealScalarLike, Y
@@ -21,9 +21,8 @@ from .._constraint.constraint import AbstractConstraint
 from .._constraint.residual import jacobian, residual_vector, row_scale
 from .._constraint.settings import NewtonProjection
 from .._linalg.newton import chord, implicit_root, SquareSystem, without_derivative
-from .base import check_no_mass_matrix
+from .base import check_one_equation
 from .on_manifold import AbstractStepsOnManifold
-from .terms import has_several
 
 
 # The most simplified Newton iterations of a step. Each reduces the error by a factor of about `h^2`.
@@ -194,10 +193,5 @@ class SymmetricProjection(AbstractStepsOnManifold):
         self.state_of_coordinates = None
 
     def prepare_terms(self, terms: Any) -> Any:
-        if is_sde(terms) or has_several(terms):
-            raise ValueError(
-                "`terms` must be one ordinary differential equation, a `diffrax.ODETerm`. Use "
-                "`mj.Projected(solver, constraint)`."
-            )
-        check_no_mass_matrix(terms, "SymmetricProjection")
+        check_one_equation(terms, "SymmetricProjection")
         return terms
