@@ -108,16 +108,8 @@ class AbstractManifoldSolver(dfx.AbstractWrappedSolver):
         solver_state: HookState,
         made_jump: Any,
     ) -> tuple[Y, Y | None, dict[str, Any], HookState, RESULTS]:
-        terms = self.prepare_terms(terms)
-        frame = self.frame(terms, t0, t1, y0, args)
-        execution = self.execution(terms, t0, t1, y0, args)
-        step = execution.step(terms, frame, t0, t1, y0, args, solver_state.memory, made_jump)
-        if frame.error_of_state is not None and step.error is not None:
-            step = step._replace(error=frame.error_of_state(step.w1, step.y1, step.error))
-        if frame.verdict is not None:
-            step = step._replace(result=update_result(step.result, frame.verdict(step.y1)))
-        rejects = not isinstance(self.constraint, NoConstraint)
-        return conclude(step, t0, t1, solver_state, self.bounds_error, rejects)
+        # Traced once: Diffrax's loop and the reverse sweep look at a step several times.
+        return _step(self, terms, t0, t1, y0, args, solver_state, made_jump)
 
     def execution(
         self, terms: Any, t0: RealScalarLike, t1: RealScalarLike, y0: Y, args: Args
@@ -190,6 +182,29 @@ class AbstractManifoldSolver(dfx.AbstractWrappedSolver):
 
     def func(self, terms, t0: RealScalarLike, y0: Y, args: Args) -> Any:
         return self.inner.func(self.prepare_terms(terms), t0, y0, args)
+
+
+@eqx.filter_jit
+def _step(
+    solver: AbstractManifoldSolver,
+    terms: Any,
+    t0: RealScalarLike,
+    t1: RealScalarLike,
+    y0: Y,
+    args: Args,
+    solver_state: HookState,
+    made_jump: Any,
+) -> tuple[Y, Y | None, dict[str, Any], HookState, RESULTS]:
+    terms = solver.prepare_terms(terms)
+    frame = solver.frame(terms, t0, t1, y0, args)
+    execution = solver.execution(terms, t0, t1, y0, args)
+    step = execution.step(terms, frame, t0, t1, y0, args, solver_state.memory, made_jump)
+    if frame.error_of_state is not None and step.error is not None:
+        step = step._replace(error=frame.error_of_state(step.w1, step.y1, step.error))
+    if frame.verdict is not None:
+        step = step._replace(result=update_result(step.result, frame.verdict(step.y1)))
+    rejects = not isinstance(solver.constraint, NoConstraint)
+    return conclude(step, t0, t1, solver_state, solver.bounds_error, rejects)
 
 
 def controller_tolerances(controller: Any) -> dfx.PIDController | None:
