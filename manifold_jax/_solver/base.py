@@ -143,7 +143,8 @@ class AbstractManifoldSolver(dfx.AbstractWrappedSolver):
         self, t: RealScalarLike, y: Y, args: Args, fallback: Y | None = None
     ) -> tuple[Y, ProjectionInfo]:
         """Correct a state onto the manifold, at the true time `t`."""
-        return self.constraint.correct(self.projection, t, y, args, fallback=fallback)
+        fallback = y if fallback is None else fallback
+        return _correct(self.constraint, self.projection, t, y, args, fallback)
 
     @property
     def solver(self) -> dfx.AbstractSolver:  # pyright: ignore
@@ -182,6 +183,18 @@ class AbstractManifoldSolver(dfx.AbstractWrappedSolver):
 
     def func(self, terms, t0: RealScalarLike, y0: Y, args: Args) -> Any:
         return self.inner.func(self.prepare_terms(terms), t0, y0, args)
+
+
+@eqx.filter_jit
+def _correct(
+    constraint: AbstractConstraint,
+    projection: NewtonProjection,
+    t: RealScalarLike,
+    y: Y,
+    args: Args,
+    fallback: Y,
+) -> tuple[Y, ProjectionInfo]:
+    return constraint.correct(projection, t, y, args, fallback=fallback)
 
 
 @eqx.filter_jit
