@@ -13,6 +13,7 @@ from .._base.user_functions import evaluated
 from .._resets.reset import check_resets
 from .._solver.base import AbstractManifoldSolver
 from .._solver.step.implicit import with_accurate_stages, with_tolerances_of_stages
+from .._solver.terms import traced_once
 from .arguments import (
     check_arguments,
     check_field,
@@ -125,6 +126,7 @@ def diffeqsolve(
     constraint = getattr(solver, "constraint", None)
     if isinstance(solver, AbstractManifoldSolver):
         terms, solver = evaluated((terms, solver), args)
+    terms = traced_once(terms)
     solver = without_idle_hook(solver, t0, y0, args)
     if throw and isinstance(stepsize_controller, dfx.ConstantStepSize) and dt0 is not None:
         y0 = raise_if_unstable(y0, terms, solver, dt0)

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from typing import Any
 
 import diffrax as dfx
+import equinox as eqx
 import jax.numpy as jnp
 import jax.tree_util as jtu
 
@@ -46,6 +47,27 @@ class RewrittenTerm(dfx.AbstractTerm):
 
     def is_vf_expensive(self, t0: RealScalarLike, t1: RealScalarLike, y: Y, args: Args) -> bool:
         return self.term.is_vf_expensive(t0, t1, y, args)
+
+
+class TracedOnce(eqx.Module):
+    """A vector field that is traced once, although a solve and its derivatives evaluate it in many places."""
+
+    vector_field: Callable
+
+    def __call__(self, t: RealScalarLike, y: Y, args: Args) -> Y:
+        return _evaluate(self.vector_field, t, y, args)
+
+
+@eqx.filter_jit
+def _evaluate(vector_field: Callable, t: RealScalarLike, y: Y, args: Args) -> Y:
+    return vector_field(t, y, args)
+
+
+def traced_once(terms: Any) -> Any:
+    """Return the terms with vector fields that are traced once."""
+    is_leaf = lambda x: isinstance(x, dfx.ODETerm)
+    once = lambda x: dfx.ODETerm(TracedOnce(x.vector_field)) if is_leaf(x) else x
+    return jtu.tree_map(once, terms, is_leaf=is_leaf)
 
 
 def rewrite_terms(terms: Any, rewrite: Callable[[dfx.AbstractTerm], dfx.AbstractTerm]) -> Any:
