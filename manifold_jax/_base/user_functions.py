@@ -21,6 +21,13 @@ class AbstractOfArgs(eqx.Module):
         """Return the value, which depends on nothing else."""
 
 
+@eqx.filter_jit
+def call_traced_once(function: Callable, *args: Any) -> Any:
+    """Return `function(*args)`. It is traced once, although a solve and its derivatives evaluate it in many
+    places; XLA sees its operations in each."""
+    return function(*args)
+
+
 def evaluated(tree: Any, args: Args) -> Any:
     """Return `tree` with every [`AbstractOfArgs`][] in it replaced by its value at these `args`.
     Inside a loop it would be evaluated in every stage, correction and derivative.

@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 
 from .._base.shapes import are_alike, shapes
 from .._base.types import Args, RealScalarLike, Y
+from .._base.user_functions import call_traced_once
 from .._constraint.residual import as_time, jacobian
 from .._linalg.rows import AbstractRows, Rows
 from .._linalg.sparse import Choice, choose_structure, SparseRows, Structure
@@ -59,7 +60,8 @@ class Kinematics(NamedTuple):
     def position(self, t: Array, x: Vector, args: Args) -> Float[Array, " p"]:
         if self.system.holonomic is None:
             return jnp.zeros((0,), x.dtype)
-        return jfu.ravel_pytree(self.system.holonomic(t, self.unravel(x), args))[0]
+        phi = call_traced_once(self.system.holonomic, t, self.unravel(x), args)
+        return jfu.ravel_pytree(phi)[0]
 
     def velocity(self, t: Array, w: Vector, context: tuple[Vector, Args]) -> Float[Array, " m"]:
         """Return the residual of the velocities at the positions in `context`."""
@@ -73,7 +75,8 @@ class Kinematics(NamedTuple):
     def _nonholonomic(self, t: Array, w: Vector, context: tuple[Vector, Args]) -> Array:
         x, args = context
         assert self.nonholonomic is not None
-        return jfu.ravel_pytree(self.nonholonomic(t, self.unravel(x), self.unravel(w), args))[0]
+        a = call_traced_once(self.nonholonomic, t, self.unravel(x), self.unravel(w), args)
+        return jfu.ravel_pytree(a)[0]
 
     def positions(self) -> Float[Array, " p"]:
         return self.position(self.t, self.x, self.args)
@@ -126,7 +129,7 @@ class Kinematics(NamedTuple):
 
     def mass_values(self) -> Float[Array, "..."] | InvertedBlocks:
         q, v = self.unravel(self.x), self.unravel(self.w)
-        return mass_values(self.system.mass_matrix(self.t, q, v, self.args), q)
+        return mass_values(call_traced_once(self.system.mass_matrix, self.t, q, v, self.args), q)
 
 
 def flat(y: Y) -> tuple[Vector, Vector]:

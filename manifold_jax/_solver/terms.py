@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 
 from .._base.types import Args, RealScalarLike, Y
+from .._base.user_functions import call_traced_once
 
 
 class DirectedTerm(dfx.AbstractTerm):
@@ -50,17 +51,12 @@ class RewrittenTerm(dfx.AbstractTerm):
 
 
 class TracedOnce(eqx.Module):
-    """A vector field that is traced once, although a solve and its derivatives evaluate it in many places."""
+    """A vector field that is traced once."""
 
     vector_field: Callable
 
     def __call__(self, t: RealScalarLike, y: Y, args: Args) -> Y:
-        return _evaluate(self.vector_field, t, y, args)
-
-
-@eqx.filter_jit
-def _evaluate(vector_field: Callable, t: RealScalarLike, y: Y, args: Args) -> Y:
-    return vector_field(t, y, args)
+        return call_traced_once(self.vector_field, t, y, args)
 
 
 def traced_once(terms: Any) -> Any:
