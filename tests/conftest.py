@@ -39,7 +39,15 @@ def _bounded_mappings():
 
 
 @pytest.fixture
-def missing_entry(monkeypatch):
+def traced_anew():
+    """For tests that change a module: they use nothing that was traced before, and leave nothing."""
+    jax.clear_caches()
+    yield
+    jax.clear_caches()
+
+
+@pytest.fixture
+def missing_entry(traced_anew, monkeypatch):
     """As if a rule of the walk through the constraint were wrong: equation 5 not known to depend on
     unknown 0."""
     from manifold_jax._linalg.sparse import structure  # not before the type checks are in place

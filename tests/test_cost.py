@@ -67,6 +67,7 @@ def test_projection_costs_no_field_and_one_jacobian_per_step(solver, stages):
     assert 2 * attempted <= projected["residual"] <= 21 * attempted
 
 
+@pytest.mark.usefixtures("traced_anew")
 def test_the_derivative_of_a_stage_is_computed_once(monkeypatch):
     """XLA copies products into every kernel that needs them, but no division (`derivative_once`). If this
     fails as the counts are equal, the division is not needed any more."""
@@ -80,7 +81,7 @@ def test_the_derivative_of_a_stage_is_computed_once(monkeypatch):
         return step[0][0][0]
 
     def operations():
-        jax.clear_caches()  # steps are traced once
+        jax.clear_caches()
         gradients = optimized_jit(jax.vmap(jax.grad(lambda scale: end(scale))))
         analysis = gradients.lower(jnp.linspace(0.9, 1.1, 8)).compile().cost_analysis()
         return (analysis[0] if isinstance(analysis, list) else analysis)["flops"]

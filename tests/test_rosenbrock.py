@@ -200,6 +200,7 @@ def test_orders(name, case, order, steps):
         pytest.param("Rodas3P", varying_regular, marks=pytest.mark.slow),
     ],
 )
+@pytest.mark.usefixtures("traced_anew")
 def test_stages_in_a_loop(name, case, monkeypatch):
     """Of long vector fields, with derivatives: as those that are written out."""
     terms, y0, _ = case(0.9)
@@ -214,6 +215,7 @@ def test_stages_in_a_loop(name, case, monkeypatch):
     results = []
     for limit in (0, 10**9):
         monkeypatch.setattr(stages, "LARGEST_UNROLLED", limit)
+        jax.clear_caches()
         both = lambda y0, h: (step(y0, h), jax.jacrev(step, (0, 1))(y0, h))
         traced = jax.jit(both).trace(y0, jnp.asarray(0.1))
         assert ("scan" in str(traced.jaxpr)) == (limit == 0)

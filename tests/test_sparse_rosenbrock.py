@@ -128,6 +128,7 @@ def end(structure, system, args, t1=0.3, **options):
 
 def methods_found(monkeypatch):
     """Record which methods are chosen."""
+    jax.clear_caches()
     chosen = []
     choose = sparsity.choose_sparsity
 

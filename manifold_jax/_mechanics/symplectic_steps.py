@@ -60,6 +60,7 @@ class RATTLESteps(dfx.AbstractSolver):
     def func(self, terms, t0, y0: Y, args: Args) -> Any:
         return terms.vf(t0, y0, args)
 
+    @eqx.filter_jit  # traced once
     def step(
         self,
         terms,

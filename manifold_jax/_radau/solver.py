@@ -126,6 +126,7 @@ class RadauIIA5(AbstractMassMatrixSolver, dfx.AbstractImplicitSolver):
         none = jnp.zeros((3, x.size), x.dtype)
         return RadauState(length, derivative, usable, none, jnp.zeros_like(length))
 
+    @eqx.filter_jit  # traced once
     def step(
         self,
         terms: Any,

@@ -86,6 +86,7 @@ class AbstractRosenbrock(AbstractMassMatrixSolver):
         derivative, usable = self.derivative_at_start(system, y0, self.structure)
         return RosenbrockState(jnp.abs(jnp.asarray(t1) - t0), derivative, usable)
 
+    @eqx.filter_jit  # traced once
     def step(
         self,
         terms: Any,

@@ -98,6 +98,8 @@ class AbstractManifoldSolver(dfx.AbstractWrappedSolver):
         memory = execution.initial_memory(terms, frame, t0, t1, y0, args)
         return HookState.initial(memory, t0, t1, y0)
 
+    # Traced once, although the loop of Diffrax and the reverse sweep look at a step several times.
+    @eqx.filter_jit
     def step(
         self,
         terms,
@@ -108,8 +110,16 @@ class AbstractManifoldSolver(dfx.AbstractWrappedSolver):
         solver_state: HookState,
         made_jump: Any,
     ) -> tuple[Y, Y | None, dict[str, Any], HookState, RESULTS]:
-        # Traced once: Diffrax's loop and the reverse sweep look at a step several times.
-        return _step(self, terms, t0, t1, y0, args, solver_state, made_jump)
+        terms = self.prepare_terms(terms)
+        frame = self.frame(terms, t0, t1, y0, args)
+        execution = self.execution(terms, t0, t1, y0, args)
+        step = execution.step(terms, frame, t0, t1, y0, args, solver_state.memory, made_jump)
+        if frame.error_of_state is not None and step.error is not None:
+            step = step._replace(error=frame.error_of_state(step.w1, step.y1, step.error))
+        if frame.verdict is not None:
+            step = step._replace(result=update_result(step.result, frame.verdict(step.y1)))
+        rejects = not isinstance(self.constraint, NoConstraint)
+        return conclude(step, t0, t1, solver_state, self.bounds_error, rejects)
 
     def execution(
         self, terms: Any, t0: RealScalarLike, t1: RealScalarLike, y0: Y, args: Args
@@ -195,29 +205,6 @@ def _correct(
     fallback: Y,
 ) -> tuple[Y, ProjectionInfo]:
     return constraint.correct(projection, t, y, args, fallback=fallback)
-
-
-@eqx.filter_jit
-def _step(
-    solver: AbstractManifoldSolver,
-    terms: Any,
-    t0: RealScalarLike,
-    t1: RealScalarLike,
-    y0: Y,
-    args: Args,
-    solver_state: HookState,
-    made_jump: Any,
-) -> tuple[Y, Y | None, dict[str, Any], HookState, RESULTS]:
-    terms = solver.prepare_terms(terms)
-    frame = solver.frame(terms, t0, t1, y0, args)
-    execution = solver.execution(terms, t0, t1, y0, args)
-    step = execution.step(terms, frame, t0, t1, y0, args, solver_state.memory, made_jump)
-    if frame.error_of_state is not None and step.error is not None:
-        step = step._replace(error=frame.error_of_state(step.w1, step.y1, step.error))
-    if frame.verdict is not None:
-        step = step._replace(result=update_result(step.result, frame.verdict(step.y1)))
-    rejects = not isinstance(solver.constraint, NoConstraint)
-    return conclude(step, t0, t1, solver_state, solver.bounds_error, rejects)
 
 
 def controller_tolerances(controller: Any) -> dfx.PIDController | None:

@@ -47,6 +47,7 @@ class RelaxedSteps(dfx.AbstractSolver):
     def func(self, terms, t0, y0: Y, args: Args) -> Any:
         return self.method.func(terms, t0, y0, args)
 
+    @eqx.filter_jit  # traced once
     def step(
         self,
         terms,
