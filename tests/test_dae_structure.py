@@ -8,9 +8,10 @@ import pytest
 
 from manifold_jax._dae.equations import ResidualEquations
 from manifold_jax._dae.occurrence import Example, nonlinear_unknowns, Occurrence
-from manifold_jax._dae.signature import ABSENT, DAEStructure, signature, SingularParts
+from manifold_jax._dae.signature import ABSENT, DAEStructure, signature
 from manifold_jax._jaxpr.incidence import incidence
 from manifold_jax._linalg.coloring import greedy_colors
+from manifold_jax._linalg.singular_parts import SingularParts
 
 
 def depends(function, n=6):

@@ -1,5 +1,6 @@
 """Rosenbrock methods whose linear systems are solved with sparse matrices."""
 
+import re
 import subprocess
 import sys
 
@@ -248,8 +249,15 @@ def test_refusals(monkeypatch):
     x = jnp.ones(70)
     with pytest.raises(ValueError, match="most of the 70 equations of `terms` depend on most"):
         sparsity.choose_sparsity("sparse", lambda x: x * jnp.sum(x), x, None)
-    with pytest.raises(ValueError, match="structurally singular: however the unknowns"):
+    # Two equations for one unknown, and thirteen for twelve.
+    shared = "places of `y[0]`, `y[1]` are too many for the unknowns in them: `y[1]` "
+    with pytest.raises(ValueError, match=re.escape(shared)):
         sparsity.choose_sparsity("sparse", lambda x: x.at[0].set(x[1]), x, x, np.ones(70, bool))
+    ring = lambda x: x.at[:12].set(x[:12] + jnp.roll(x[:12], 1)).at[12].set(x[0])
+    with pytest.raises(
+        ValueError, match=r"`y\[9\]` and 3 more are too many .* `y\[9\]` and 2 more"
+    ):
+        sparsity.choose_sparsity("sparse", ring, x, x, np.ones(70, bool))
     with pytest.raises(ValueError, match=r"Install klujax .*manifold_jax\[sparse\]"):
         sparsity.choose_sparsity("sparse", wide, x, None)
 

@@ -74,3 +74,9 @@ def refuse_old_names(**names: str) -> Callable[[Function], Function]:
         return cast(Function, call)
 
     return decorate
+
+
+def listed(names: list[str], most: int = 8) -> str:
+    """Join names for a message."""
+    text = ", ".join(f"`{name}`" for name in names[:most])
+    return text if len(names) <= most else f"{text} and {len(names) - most} more"

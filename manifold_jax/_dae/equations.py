@@ -37,12 +37,6 @@ def leaf_names(tree: Any, alone: str) -> list[tuple[str, list[str]]]:
     return found
 
 
-def listed(names: list[str], most: int = 8) -> str:
-    """Join names for a message."""
-    text = ", ".join(f"`{name}`" for name in names[:most])
-    return text if len(names) <= most else f"{text} and {len(names) - most} more"
-
-
 class EquationCombination(NamedTuple):
     """Replaces equation `row` by the sum of `weight * equation` over `parts`."""
 

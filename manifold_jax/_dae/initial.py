@@ -11,7 +11,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._base.errors import clear_errors
+from .._base.errors import clear_errors, listed
 from .._base.numbers import numbers_as_arrays
 from .._base.types import Args, BoolScalar, FloatScalar, RealScalarLike, Y
 from .._constraint.projection_info import ProjectionInfo
@@ -20,7 +20,7 @@ from .._constraint.settings import NewtonProjection
 from .._linalg.dense import gram
 from .._linalg.newton import find_root, implicit_root, SquareSystem, without_derivative
 from .._linalg.pivoted import factorize_equilibrated
-from .equations import leaf_names, listed
+from .equations import leaf_names
 from .highest_derivatives import HighestDerivatives
 from .layout import Gather, StateLayout
 from .nearest import Constrained, depends_on_fixed_only, free_components, nearest_state, with_lifted

@@ -9,16 +9,17 @@ import jax.flatten_util as jfu
 import jax.numpy as jnp
 import jax.tree_util as jtu
 
+from .._base.errors import listed
 from .._base.numbers import with_arrays
 from .._base.types import Args, Y
+from .._linalg.singular_parts import SingularParts
 from .analysis import Analysis
 from .combined import without_cancellations
-from .equations import listed, Names, ResidualEquations
+from .equations import Names, ResidualEquations
 from .occurrence import Example, Occurrence
 from .reduced import Reduced
 from .report import DAEReport
 from .samples import dependent_rows
-from .signature import SingularParts
 from .system import ReducedDAE
 
 

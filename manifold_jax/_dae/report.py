@@ -4,8 +4,8 @@ import dataclasses
 
 import numpy as np
 
+from .._base.errors import listed
 from .analysis import Analysis
-from .equations import listed
 from .signature import ABSENT
 
 

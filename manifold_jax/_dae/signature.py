@@ -7,8 +7,6 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
-from scipy.sparse import csr_array
-from scipy.sparse.csgraph import maximum_bipartite_matching
 
 
 # In a signature matrix: the unknown does not occur in the equation.
@@ -64,36 +62,3 @@ def signature(occurs: np.ndarray) -> np.ndarray:
     `i`."""
     highest = occurs.shape[1] - 1 - np.argmax(occurs[:, ::-1], axis=1)
     return np.where(occurs.any(axis=1), highest, ABSENT)
-
-
-class SingularParts(NamedTuple):
-    """The singular parts of a matrix without a transversal (Dulmage & Mendelsohn, Canad. J. Math. 10
-    (1958) 517-534): the equations that have too few unknowns for all of them, with those unknowns, and
-    the unknowns that have too few equations, with those equations."""
-
-    overdetermined: tuple[np.ndarray, np.ndarray]  # equations, unknowns
-    underdetermined: tuple[np.ndarray, np.ndarray]
-
-    @staticmethod
-    def of(there: np.ndarray) -> "SingularParts":
-        unknown_of = maximum_bipartite_matching(csr_array(there), perm_type="column")
-        equation_of = np.full(there.shape[1], -1)
-        matched = unknown_of >= 0
-        equation_of[unknown_of[matched]] = np.nonzero(matched)[0]
-        over = _reached(there, ~matched, equation_of)
-        under = _reached(there.T, equation_of < 0, unknown_of)
-        return SingularParts(over, (under[1], under[0]))
-
-
-def _reached(
-    there: np.ndarray, start: np.ndarray, back: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Follow alternating paths: rows from `start`, to columns, and to the rows these belong to."""
-    rows = start.copy()
-    while True:
-        columns = there[rows].any(axis=0)
-        after = rows.copy()
-        after[back[columns & (back >= 0)]] = True
-        if (after == rows).all():
-            return np.nonzero(rows)[0], np.nonzero(columns)[0]
-        rows = after

@@ -8,6 +8,7 @@ import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Array, Float
 
+from .._base.errors import listed
 from .._base.klu import has_klu
 from .._linalg.sparse import Choice, dependence, Method, program_of, SquarePattern
 
@@ -61,7 +62,7 @@ def choose_sparsity(
         return None
     if pattern.transversal is None:
         if choice == "sparse":
-            raise ValueError(_SINGULAR)
+            raise ValueError(_singular(pattern))
         return None
     is_unknown = mass is not None and massless is None
     if choice == "auto" and is_unknown and not _has_diagonal(function, x):
@@ -85,16 +86,23 @@ _NOT_SPARSE = (
     "from the traced function. Write the indices and sparse matrices in them as NumPy arrays that the function closes "
     "over, not in `args`, or use `structure='dense'`."
 )
-_SINGULAR = (
-    "`structure='sparse'`, but the equations of `terms` are structurally singular: however the unknowns are assigned to "
-    "the equations, one of the equations is left without an unknown of its own. The index is above 1: reduce it, for "
-    "example with `mj.reduce_dae`, or remove what is redundant."
-)
 _NO_LIBRARY = (
     "`structure='sparse'`, but reordered the equations of `terms` are coupled in blocks of {width}, too wide to be "
     "eliminated without a library. Install klujax (`pip install klujax`, the extra `manifold_jax[sparse]`; for CPUs "
     "and 64-bit numbers), or use `structure='dense'`."
 )
+
+
+def _singular(pattern: SquarePattern) -> str:
+    named = lambda numbers: listed([f"y[{i}]" for i in numbers], most=10) or "none"
+    equations, unknowns = map(named, pattern.singular_parts.overdetermined)
+    return (
+        "`structure='sparse'`, but the equations of `terms` are structurally singular: however the unknowns are assigned to "
+        "the equations, one of the equations is left without an unknown of its own. Those in the places of "
+        f"{equations} are too many for the unknowns in them: {unknowns} (numbers of `y` as "
+        "`jax.flatten_util.ravel_pytree` orders them). The index is above 1: reduce it, for example with `mj.reduce_dae`, "
+        "or remove what is redundant."
+    )
 
 
 _FOUND: dict[Any, SquarePattern | None] = {}

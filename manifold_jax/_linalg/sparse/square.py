@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool, Float
 from scipy.sparse.csgraph import maximum_bipartite_matching
 
 from ..coloring import greedy_colors
+from ..singular_parts import SingularParts
 from .block_order import BlockOrder
 
 
@@ -42,6 +43,10 @@ class SquarePattern:
         if (column_of < 0).any():
             return None
         return np.flatnonzero(column_of[self.rows] == self.columns).astype(np.int32)
+
+    @property
+    def singular_parts(self) -> SingularParts:
+        return SingularParts.of(self._matrix() != 0)
 
     @functools.cached_property
     def color(self) -> np.ndarray:
