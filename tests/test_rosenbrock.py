@@ -628,6 +628,30 @@ def test_badly_conditioned_algebraic_equations():
     assert term.consistent_state(0.0, y.at[3].add(1e-6))[1].correction > 1e-7
 
 
+def test_a_mass_that_is_switched_on():
+    """An algebraic equation that becomes a differential one: refused, unless the time is known."""
+
+    def mass(t, y, args):
+        return jnp.where(jnp.arange(2) == 0, 1.0, jnp.where(t < 1.0, 0.0, 1.0))
+
+    decay = lambda t, y, args: jnp.stack([-y[0], jnp.cos(3 * t) - y[1]])
+    controller = dfx.PIDController(rtol=1e-8, atol=1e-8)
+    solve = lambda controller: mj.diffeqsolve(
+        mj.MassMatrixTerm(decay, mass),
+        mj.Rodas5P(),
+        0.0,
+        2.0,
+        None,
+        jnp.ones(2),
+        stepsize_controller=controller,
+    )
+    with pytest.raises(RuntimeError, match="a mass that was zero is not any more"):
+        solve(controller)
+    sol = solve(dfx.ClipStepSizeController(controller, jump_ts=jnp.array([1.0])))
+    after = solve_ivp(lambda t, y: np.cos(3 * t) - y, (1, 2), [np.cos(3)], rtol=1e-11, atol=1e-11)
+    np.testing.assert_allclose(sol.ys[0, 1], after.y[0, -1], rtol=1e-7)
+
+
 def test_index_two():
     """A multiplier that no equation contains, and a mass matrix of which nothing is left."""
     field = lambda t, y, args: jnp.stack([y[1], y[0] - jnp.sin(t)])

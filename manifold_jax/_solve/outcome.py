@@ -40,8 +40,9 @@ NO_TIME = "`t0` or `t1` is NaN (or `t0` infinite): nothing was solved."
 _SINGULAR = (
     "A step could not be made: `y0` does not satisfy the algebraic equations (see "
     "`mj.MassMatrixTerm.consistent_state`), or the matrix M - h gamma df/dy is singular or not finite, as where the index "
-    "of M y' = f is above 1 (reduce it, for example with `mj.reduce_dae`), or the stages of `mj.RadauIIA5` have no solution "
-    "at this step size."
+    "of M y' = f is above 1 (reduce it, for example with `mj.reduce_dae`) or a mass that was zero is not any more (give "
+    "the times as `jump_ts` of `diffrax.ClipStepSizeController`), or the stages of `mj.RadauIIA5` have no solution at this "
+    "step size."
 )
 _TOO_MANY = (
     "The maximum number of solver steps was reached. A long solve needs a larger `max_steps`, a stiff one `mj.Rodas5P()`; "
