@@ -42,7 +42,9 @@ class MassMatrixTerm(dfx.AbstractTerm):
         has to be zero.
     - `mass`: the matrix, or a callable `M(t, y, args)` that returns it: a scalar, the diagonal (shape
         `(n,)`, or a pytree with the structure and shapes of `y`), or a matrix of shape `(n, n)`, for
-        the `n` numbers of `y` in the order of `jax.flatten_util.ravel_pytree`. Of constant rank.
+        the `n` numbers of `y` in the order of `jax.flatten_util.ravel_pytree`. Of constant rank, or of one that
+        changes at times which the controller knows (`jump_ts` of `diffrax.ClipStepSizeController`). Where
+        a mass passes through zero solutions are in general not unique beyond, and nothing says so.
 
     The initial value has to satisfy the algebraic equations. [`mj.diffeqsolve`][] sees to that
     (`consistent="project"` changes only what `M` does not see, `"check"` refuses); with
