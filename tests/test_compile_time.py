@@ -104,3 +104,12 @@ def test_steps_end_where_those_of_diffrax_do(mantissa, exponent, sign, units, ke
 def test_ends_without_digits(t1, tnext, end):
     """At zero the unit of rounding is the smallest number; a solve until an event has no end."""
     assert compat._clip_to_end(-1.0, tnext, t1, t1, True) == end
+
+
+def test_a_term_of_ones_own_keeps_its_field():
+    class Slowed(dfx.ODETerm):
+        def vf(self, t, y, args):
+            return 0.5 * self.vector_field(t, y, args)
+
+    sol = mj.diffeqsolve(Slowed(lambda t, y, args: -y), dfx.Tsit5(), 0.0, 1.0, 0.1, jnp.ones(1))
+    np.testing.assert_allclose(sol.ys[0, 0], np.exp(-0.5), rtol=1e-6)

@@ -61,7 +61,7 @@ class TracedOnce(eqx.Module):
 
 def traced_once(terms: Any) -> Any:
     """Return the terms with vector fields that are traced once."""
-    is_leaf = lambda x: isinstance(x, dfx.ODETerm)
+    is_leaf = lambda x: type(x) is dfx.ODETerm  # a subclass may have another field
     once = lambda x: dfx.ODETerm(TracedOnce(x.vector_field)) if is_leaf(x) else x
     return jtu.tree_map(once, terms, is_leaf=is_leaf)
 
