@@ -9,6 +9,8 @@ from ._applications import (
     gradient_flow as gradient_flow,
     Linearization as Linearization,
     linearize as linearize,
+    OptimalTrajectory as OptimalTrajectory,
+    optimize_trajectory as optimize_trajectory,
     regulate as regulate,
     Regulator as Regulator,
     trace_curve as trace_curve,
