@@ -6,7 +6,7 @@ import numpy as np
 import scipy.optimize as opt
 import scipy.sparse as sp
 
-from .transcription import Iterate, sum_entries, Transcription
+from .transcription import Evaluation, sum_entries, Transcription
 
 
 # So many iterations are made in the same charts. A chart far from its center is steep: problems that need
@@ -27,7 +27,7 @@ class BlockHessian:
         count, size = transcription.places.shape
         self.transcription = transcription
         self.blocks = np.tile(_FIRST_CURVATURE * np.eye(size), (count, 1, 1))
-        self.before: tuple[np.ndarray, Iterate] | None = None
+        self.before: tuple[np.ndarray, Evaluation] | None = None
 
     def at(self, v: np.ndarray, multipliers: np.ndarray) -> sp.csr_array:
         """Return the matrix at the next iterate."""
@@ -62,18 +62,19 @@ class BlockHessian:
 def minimize(
     transcription: Transcription,
     start: np.ndarray,
-    bounds: opt.Bounds,
+    bounds: np.ndarray,
     max_iterations: int,
     tolerance: float,
 ) -> tuple[Transcription, opt.OptimizeResult]:
     """Minimize the cost where the residual is zero and the inputs are within their bounds; return the
     transcription with the last charts, too, and the number of all iterations in `nit`."""
-    hessian, iterations, v = BlockHessian(transcription), 0, start
+    hessian, iterations, v, before = BlockHessian(transcription), 0, start, np.inf
     options: dict[str, Any] = dict(initial_barrier_parameter=1e-2)
     while True:
         T, limit = transcription, min(_IN_THE_SAME_CHARTS, max_iterations - iterations)
         none = sp.csr_array((T.size, T.size))
-        closed = opt.NonlinearConstraint(T.residual, 0, 0, jac=T.jacobian, hess=hessian.at)
+        jacobian: Any = T.jacobian
+        closed = opt.NonlinearConstraint(T.residual, 0, 0, jac=jacobian, hess=hessian.at)
         result = opt.minimize(
             T.cost,
             v,
@@ -85,7 +86,10 @@ def minimize(
             options=dict(maxiter=limit, gtol=tolerance, xtol=1e-12, **options),
         )
         iterations += result.nit
-        finished = result.status == 1 or (result.status == 2 and result.nit < 3)
+        # Steps of which rounding leaves nothing are too small twice.
+        change, before = abs(result.fun - before), result.fun
+        still = result.status == 2 and change <= 1e-9 * (1 + abs(result.fun))
+        finished = result.status == 1 or still
         if finished or iterations >= max_iterations:
             result.nit = iterations
             return T, result
@@ -94,6 +98,7 @@ def minimize(
         options = dict(
             initial_tr_radius=max(result.tr_radius, 1e-3),
             initial_constr_penalty=result.constr_penalty,
-            initial_barrier_parameter=result.barrier_parameter,
-            initial_barrier_tolerance=result.barrier_tolerance,
         )
+        if "barrier_parameter" in result:  # not without bounds
+            options["initial_barrier_parameter"] = result.barrier_parameter
+            options["initial_barrier_tolerance"] = result.barrier_tolerance

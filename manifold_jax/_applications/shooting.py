@@ -110,16 +110,15 @@ class Knots(NamedTuple):
     by_z: Float[Array, "K n d"]
 
 
-class Ends(NamedTuple):
-    """The states reached at the ends of all intervals, and in tangent coordinates there with the cost as the
-    last component; their derivatives by `p`: the coordinates of the first knot and the inputs at both."""
+class IntervalEnds(NamedTuple):
+    """The states reached at the ends of all intervals, with the cost as the last component, and their derivatives
+    by `p`: the coordinates of the first knot and the inputs at both."""
 
-    x: Float[Array, "K_1 n"]
-    reached: Float[Array, "K_1 d_1"]
-    by_p: Float[Array, "K_1 d_1 p"]
+    reached: Float[Array, "K_1 n_1"]
+    by_p: Float[Array, "K_1 n_1 p"]
 
 
-class Last(NamedTuple):
+class AtTheEnd(NamedTuple):
     """The final cost and the residual of the goal, and their derivatives by the coordinates of the knot."""
 
     values: Float[Array, " r"]
@@ -148,25 +147,22 @@ def solve_intervals(
     times: Float[Array, "K_1 2"],
     knots: Knots,
     inputs: Float[Array, "K_1 2 m"],
-    ends: Charts,
-) -> Ends:
-    """Solve all intervals at once, with first derivatives in forward mode. `ends` are the charts there."""
+) -> IntervalEnds:
+    """Solve all intervals at once, with first derivatives in forward mode."""
     d = knots.by_z.shape[2]
 
-    def interval(p: Array, times: Array, knot: Knots, inputs: Array, end: Charts) -> tuple:
+    def interval(p: Array, times: Array, knot: Knots, inputs: Array) -> tuple[Array, Array]:
         change = p[d:].reshape(inputs.shape)
-        x, cost = shooting.solve(times, knot.x + knot.by_z @ p[:d], inputs + change)
-        out = jnp.append(end.bases.T @ (x - end.centers), cost)
-        return out, (x, out)
+        out = jnp.append(*shooting.solve(times, knot.x + knot.by_z @ p[:d], inputs + change))
+        return out, out
 
     zero = jnp.zeros((times.shape[0], d + inputs[0].size), inputs.dtype)
-    each = jax.vmap(jax.jacfwd(interval, has_aux=True))
-    by_p, (x, reached) = each(zero, times, knots, inputs, ends)
-    return Ends(x, reached, by_p)
+    by_p, reached = jax.vmap(jax.jacfwd(interval, has_aux=True))(zero, times, knots, inputs)
+    return IntervalEnds(reached, by_p)
 
 
 @eqx.filter_jit
-def solve_last(shooting: Shooting, x: Float[Array, " n"], by_z: Float[Array, "n d"]) -> Last:
+def solve_last(shooting: Shooting, x: Float[Array, " n"], by_z: Float[Array, "n d"]) -> AtTheEnd:
     last = lambda z: shooting.last(shooting.unravel(x + by_z @ z))
     at = jnp.zeros(by_z.shape[1], x.dtype)
-    return Last(last(at), jax.jacfwd(last)(at))
+    return AtTheEnd(last(at), jax.jacfwd(last)(at))

@@ -15,17 +15,22 @@ import scipy.optimize as opt
 from jaxtyping import Array, Bool, Float, Int
 
 from .._base.numbers import numbers_as_arrays
-from .._base.shapes import are_alike, shapes
 from .._base.types import FloatScalar, RealScalarLike, Y
 from .._constraint.checks import check_constraint_type, check_state
 from .._constraint.constraint import AbstractConstraint
 from .._constraint.project import consistent_state
 from .quasi_newton import minimize
 from .shooting import Charts, Knots, Shooting, solve_intervals
+from .trajectory_arguments import (
+    check_number,
+    checked_bounds,
+    checked_goal,
+    checked_inputs,
+    guess_states,
+)
 from .transcription import Transcription
 
 
-_ON_MANIFOLD = 1e-6  # how far a goal may be from the manifold, relative to its size
 _CLOSED, _EXACT = 1e-6, 1e-3  # largest gaps and integration errors of a motion that is found
 
 
@@ -66,10 +71,10 @@ def optimize_trajectory(
     y0: Y,
     inputs: Any,
     *,
-    cost: Callable[[RealScalarLike, Y, Any], Any],
-    final_cost: Callable[[Y], Any] | None = None,
+    cost: Any,
+    final_cost: Any = None,
     goal: Any = None,
-    bounds: tuple[Any, Any] = (-np.inf, np.inf),
+    bounds: Any = (-np.inf, np.inf),
     states: Y | None = None,
     solver: dfx.AbstractSolver | None = None,
     steps: int = 4,
@@ -133,16 +138,16 @@ def optimize_trajectory(
         )
     if not isinstance(steps, int) or steps < 2 or steps % 2:
         raise ValueError(f"`steps` must be an even number of at least 2, got {steps!r}.")
-    ts, u = _checked_inputs(ts, inputs)
-    limits = _checked_bounds(bounds, u.shape[1])
+    ts, u = checked_inputs(ts, inputs)
+    limits = checked_bounds(bounds, u.shape[1])
     check_state(y0, "y0")
     y0, _ = consistent_state(constraint, ts[0], jtu.tree_map(jnp.asarray, y0), u[0])
-    _check_number("cost", cost, ts[0], y0, u[0])
+    check_number("cost", cost, ts[0], y0, u[0])
     if final_cost is not None:
-        _check_number("final_cost", final_cost, y0)
+        check_number("final_cost", final_cost, y0)
     is_state = goal is not None and not callable(goal)
     if is_state:
-        goal = _checked_goal(goal, y0, constraint, ts[-1], u[-1])
+        goal = checked_goal(goal, y0, constraint, ts[-1], u[-1])
     elif goal is not None and getattr(eqx.filter_eval_shape(goal, y0), "ndim", 2) > 1:
         raise ValueError(
             "`goal` must be a state like `y0`, or a function of a state that returns one array of shape (r,)."
@@ -156,59 +161,13 @@ def optimize_trajectory(
         jfu.ravel_pytree(y0)[1],
         steps,
     )
-    guess = _guess(shooting, ts, y0, u, goal if is_state else None, states)
+    guess = guess_states(shooting, ts, y0, u, goal if is_state else None, states)
     charts = Charts.around(shooting, ts, guess, u)
     transcription = Transcription.of(shooting, charts, u.shape[1], ends_free=not is_state)
     found = _solved(transcription, u, limits, max_iterations, tolerance)
     if throw and not found.success:
         raise RuntimeError(found.message)
     return found
-
-
-def _checked_inputs(ts: Any, inputs: Any) -> tuple[np.ndarray, np.ndarray]:
-    ts, inputs = np.asarray(ts, float), np.asarray(inputs, float)
-    if ts.ndim != 1 or ts.size < 3 or not np.all(np.diff(ts) > 0):
-        raise ValueError(f"`ts` must be at least three increasing times, shape (K,), got {ts}.")
-    if inputs.ndim != 2 or inputs.shape[0] != ts.size or not np.all(np.isfinite(inputs)):
-        raise ValueError(
-            f"`inputs` must be finite and have the shape ({ts.size}, m) for m inputs, got {inputs.shape}."
-        )
-    return ts, inputs
-
-
-def _checked_bounds(bounds: Any, m: int) -> np.ndarray:
-    """Return lower and upper bounds, shape `(2, m)`."""
-    if not isinstance(bounds, tuple | list) or len(bounds) != 2:
-        raise ValueError("`bounds` must be `(lower, upper)`, two numbers or arrays of shape (m,).")
-    shape = ", ".join(str(np.shape(side)) for side in bounds)
-    if any(np.shape(side) not in ((), (m,)) for side in bounds):
-        raise ValueError(f"`bounds` must be two numbers, or arrays of shape ({m},), got {shape}.")
-    limits = np.stack([np.broadcast_to(np.asarray(side, float), (m,)) for side in bounds])
-    if not np.all(limits[0] < limits[1]):
-        raise ValueError(f"`bounds`: each lower bound must be below the upper one, got {bounds}.")
-    return limits
-
-
-def _check_number(name: str, function: Any, *args: Any) -> None:
-    if not callable(function):
-        raise TypeError(f"`{name}` must be a function, got {type(function).__name__}.")
-    out = eqx.filter_eval_shape(function, *args)
-    if getattr(out, "shape", None) != ():
-        raise ValueError(f"`{name}` must return one number, got {shapes(out)}.")
-
-
-def _checked_goal(goal: Y, y0: Y, constraint: AbstractConstraint, t: Any, u: Any) -> Y:
-    if not are_alike(goal, y0):
-        raise ValueError(
-            f"`goal` must be a state like `y0`, of shapes {shapes(y0)}, or a function of a state; got {shapes(goal)}."
-        )
-    goal = jtu.tree_map(lambda a, b: jnp.asarray(a, b.dtype), goal, y0)
-    there, info = consistent_state(constraint, t, goal, u, throw=False)
-    if not bool(info.success) or not float(info.correction) <= _ON_MANIFOLD:
-        raise ValueError(
-            "`goal` is not on the manifold. Write `goal, _ = mj.consistent_state(constraint, ts[-1], goal)` if it is near."
-        )
-    return there
 
 
 def _last(final_cost: Any, goal: Any) -> Callable[[Y], Array]:
@@ -220,45 +179,6 @@ def _last(final_cost: Any, goal: Any) -> Callable[[Y], Array]:
     return last
 
 
-def _guess(
-    shooting: Shooting, ts: np.ndarray, y0: Y, u: np.ndarray, goal: Any, states: Any
-) -> np.ndarray:
-    """Return states on the manifold at all times, as vectors."""
-    first, unravel = jfu.ravel_pytree(y0)
-    last = None if goal is None else jfu.ravel_pytree(goal)[0]
-    if states is not None:
-        wanted = jtu.tree_map(lambda leaf: jnp.zeros((ts.size, *leaf.shape), leaf.dtype), y0)
-        if not are_alike(states, wanted):
-            raise ValueError(
-                f"`states` must have the shapes {shapes(wanted)}, got {shapes(states)}."
-            )
-        states = jax.vmap(lambda y: jfu.ravel_pytree(y)[0])(states)
-    found, x = [first], first
-    none = jnp.zeros((0, 0))
-    for k in range(1, ts.size):
-        if states is not None:
-            near = states[k]
-        elif last is not None:
-            near = x + (last - x) / (ts.size - k)
-        else:
-            pair = jnp.asarray(u[None, k - 1 : k + 1]), Charts(none[0], x[None], x[None, :, None])
-            start = Knots(x[None], jnp.zeros((1, x.size, 0)))
-            near = solve_intervals(shooting, jnp.asarray(ts[None, k - 1 : k + 1]), start, *pair).x[
-                0
-            ]
-        y, info = consistent_state(shooting.constraint, ts[k], unravel(near), u[k], throw=False)
-        if not bool(info.success):
-            raise ValueError(
-                f"No guess of the state at t = {ts[k]:.6g} was found on the manifold. Give `states`, near to the manifold at "
-                "all of `ts`."
-            )
-        x = jfu.ravel_pytree(y)[0]
-        found.append(x)
-    if last is not None:
-        found[-1] = last
-    return np.stack(found)
-
-
 def _solved(
     transcription: Transcription,
     u: np.ndarray,
@@ -266,23 +186,31 @@ def _solved(
     max_iterations: int,
     tolerance: float,
 ) -> OptimalTrajectory:
-    T, places = transcription, transcription.inputs
-    v, lower, upper = np.zeros(T.size), np.full(T.size, -np.inf), np.full(T.size, np.inf)
-    v[places], lower[places], upper[places] = np.clip(u, *limits), limits[0], limits[1]
+    T, v = transcription, np.zeros(transcription.size)
+    bounds = np.tile([-np.inf, np.inf], (T.size, 1))
+    v[T.inputs], bounds[T.inputs] = np.clip(u, *limits), limits.T
     bad = ~np.isfinite(T.at(v).ends.reached).all(axis=1)
     if bad.any():
         raise ValueError(
             f"The motion from t = {float(T.charts.ts[np.argmax(bad)]):.6g} on cannot be solved with the guessed states and inputs. "
             "Give other `states` or `inputs`, or more `steps`."
         )
-    T, result = minimize(T, v, opt.Bounds(lower, upper), max_iterations, tolerance)
-    v = np.clip(result.x, lower, upper)
-    now, measured = T.at(v), _measured(T, v)
+    T, result = minimize(T, v, bounds, max_iterations, tolerance)
+    v = np.clip(result.x, *bounds.T)
+    measured = _measured(T, v)
     message = _message(result, *measured)
-    ys = jax.vmap(T.shooting.unravel)(jnp.asarray(now.knots.x))
-    counts = jnp.asarray(result.nit), jnp.asarray(T.evaluations)
-    numbers = map(jnp.asarray, (T.cost(v), measured.gap, measured.error, not message))
-    return OptimalTrajectory(T.charts.ts, ys, jnp.asarray(now.u), *numbers, *counts, message)
+    return OptimalTrajectory(
+        ts=T.charts.ts,
+        ys=jax.vmap(T.shooting.unravel)(jnp.asarray(T.at(v).knots.x)),
+        inputs=jnp.asarray(T.at(v).u),
+        cost=jnp.asarray(T.cost(v)),
+        gap=jnp.asarray(measured.gap),
+        integration_error=jnp.asarray(measured.error),
+        success=jnp.asarray(not message),
+        num_iterations=jnp.asarray(result.nit),
+        num_evaluations=jnp.asarray(T.evaluations),
+        message=message,
+    )
 
 
 class Measured(NamedTuple):
@@ -294,23 +222,17 @@ class Measured(NamedTuple):
 
 
 def _measured(T: Transcription, v: np.ndarray) -> Measured:
-    now, ends = T.at(v), Charts(*(leaf[1:] for leaf in T.charts))
-    size = 1 + np.abs(now.knots.x).max()
-    gaps = np.abs(now.ends.x - now.knots.x[1:]).max(axis=1) / size
-    ts, u = np.asarray(T.charts.ts), now.u
+    now, ts, u = T.at(v), np.asarray(T.charts.ts), T.at(v).u
+    size, coarse = 1 + np.abs(now.knots.x).max(), now.ends.reached[:, :-1]
+    gaps = np.abs(coarse - now.knots.x[1:]).max(axis=1) / size
     middle, between = (ts[1:] + ts[:-1]) / 2, (u[1:] + u[:-1]) / 2
-    x, by_z = now.knots.x[:-1], now.knots.by_z[:-1]
-    for times, pairs in (
-        ((ts[:-1], middle), (u[:-1], between)),
-        ((middle, ts[1:]), (between, u[1:])),
-    ):
-        given = (
-            np.stack(times, axis=1),
-            Knots(jnp.asarray(x), jnp.asarray(by_z)),
-            np.stack(pairs, axis=1),
-        )
-        x = solve_intervals(T.shooting, *jtu.tree_map(jnp.asarray, given), ends).x
-    error = float(np.abs(np.asarray(x) - now.ends.x).max() / size)
+    halves = ((ts[:-1], middle), (u[:-1], between)), ((middle, ts[1:]), (between, u[1:]))
+    x, by_z = now.knots.x[:-1], jnp.asarray(now.knots.by_z[:-1])
+    for times, inputs in halves:
+        times, pairs = (jnp.asarray(np.stack(pair, axis=1)) for pair in (times, inputs))
+        ends = solve_intervals(T.shooting, times, Knots(jnp.asarray(x), by_z), pairs)
+        x = np.asarray(ends.reached[:, :-1])
+    error = float(np.abs(x - coarse).max() / size)
     worst = int(np.argmax(np.nan_to_num(gaps, nan=np.inf)))
     return Measured(float(gaps[worst]), float(ts[worst + 1]), error)
 

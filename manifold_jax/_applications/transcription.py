@@ -8,19 +8,32 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.sparse as sp
 
-from .shooting import Charts, Ends, Knots, Last, Shooting, solve_intervals, solve_last, states_at
+from .shooting import (
+    AtTheEnd,
+    Charts,
+    IntervalEnds,
+    Knots,
+    Shooting,
+    solve_intervals,
+    solve_last,
+    states_at,
+)
 
 
 _FAR = 1e10  # what a gap is where a solve fails, so that the step there is refused
 
 
-class Iterate(NamedTuple):
-    """Everything at one vector of unknowns, as NumPy arrays."""
+class Evaluation(NamedTuple):
+    """Everything at one vector of unknowns, as NumPy arrays; `gaps` are those between the ends of intervals and
+    the knots there, `(K - 1, d)`, with their derivatives by the unknowns before and after them."""
 
     knots: Knots
     u: np.ndarray
-    ends: Ends
-    last: Last
+    ends: IntervalEnds
+    last: AtTheEnd
+    gaps: np.ndarray
+    by_start: np.ndarray
+    by_end: np.ndarray
 
 
 @dataclasses.dataclass
@@ -46,7 +59,7 @@ class Transcription:
 
     @property
     def size(self) -> int:
-        return self.inputs.max() + 1
+        return int(self.inputs.max()) + 1
 
     @property
     def places(self) -> np.ndarray:
@@ -55,23 +68,25 @@ class Transcription:
         knots, inputs = self.knots, self.inputs
         return np.concatenate([knots[:-1], inputs[:-1], inputs[1:], knots[1:]], axis=1)
 
-    def at(self, v: np.ndarray) -> Iterate:
+    def at(self, v: np.ndarray) -> Evaluation:
         if self._key != v.tobytes():
             self.evaluations += 1
-            z, u = jnp.asarray(np.append(v, 0.0)[self.knots]), jnp.asarray(v[self.inputs])
-            knots = states_at(self.shooting, self.charts, z, u)
-            starts, ends = Knots(*(leaf[:-1] for leaf in knots)), self._ends
-            pairs = jnp.stack([u[:-1], u[1:]], axis=1)
-            times = jnp.stack([self.charts.ts[:-1], self.charts.ts[1:]], axis=1)
-            reached = solve_intervals(self.shooting, times, starts, pairs, ends)
-            last = solve_last(self.shooting, knots.x[-1], knots.by_z[-1])
-            self._iterate = jax.tree.map(np.asarray, Iterate(knots, u, reached, last))
-            self._key = v.tobytes()
+            self._iterate, self._key = self._evaluated(v), v.tobytes()
         return self._iterate
 
-    @property
-    def _ends(self) -> Charts:
-        return Charts(*(leaf[1:] for leaf in self.charts))
+    def _evaluated(self, v: np.ndarray) -> Evaluation:
+        z, u = jnp.asarray(np.append(v, 0.0)[self.knots]), jnp.asarray(v[self.inputs])
+        knots = states_at(self.shooting, self.charts, z, u)
+        starts = Knots(*(leaf[:-1] for leaf in knots))
+        pairs = jnp.stack([u[:-1], u[1:]], axis=1)
+        times = jnp.stack([self.charts.ts[:-1], self.charts.ts[1:]], axis=1)
+        ends = solve_intervals(self.shooting, times, starts, pairs)
+        last = solve_last(self.shooting, knots.x[-1], knots.by_z[-1])
+        knots, u, ends, last = jax.tree.map(np.asarray, (knots, u, ends, last))
+        differences = ends.reached[:, :-1] - knots.x[1:]
+        gaps, slopes = gaps_of(differences, np.asarray(self.charts.bases[1:]))
+        by_start, by_end = slopes @ ends.by_p[:, :-1], -slopes @ knots.by_z[1:]
+        return Evaluation(knots, u, ends, last, gaps, by_start, by_end)
 
     def cost(self, v: np.ndarray) -> float:
         now = self.at(v)
@@ -79,41 +94,34 @@ class Transcription:
         return float(total) if np.isfinite(total) else _FAR
 
     def cost_gradient(self, v: np.ndarray) -> np.ndarray:
-        none = np.zeros(self.residual(v).size)
-        gradient = np.zeros(self.size + 1)
+        gradient, none = np.zeros(self.size + 1), np.zeros(self.residual(v).size)
         np.add.at(gradient, self.places, self.gradients(self.at(v), none))
         return gradient[:-1]
 
     def residual(self, v: np.ndarray) -> np.ndarray:
         """Return the gaps between intervals and the residual of the goal."""
-        now, (_, centers, bases) = self.at(v), self._ends
-        away = np.einsum("knd,kn->kd", bases, now.knots.x[1:] - centers)
-        gaps = now.ends.reached[:, :-1] - away
-        return np.nan_to_num(np.append(gaps, now.last.values[1:]), nan=_FAR)
+        now = self.at(v)
+        return np.nan_to_num(np.append(now.gaps, now.last.values[1:]), nan=_FAR)
 
     def jacobian(self, v: np.ndarray) -> sp.csr_array:
         now = self.at(v)
-        gaps = np.concatenate([now.ends.by_p[:, :-1], self._by_end(now)], axis=2)
-        count, d, _ = gaps.shape
+        count, d = now.gaps.shape
         rows = np.arange(count * d).reshape(count, d, 1)
         of_goal = count * d + np.arange(now.last.values.size - 1)[:, None]
+        gaps = np.concatenate([now.by_start, now.by_end], axis=2)
         parts = [
             (rows, self.places[:, None, :], gaps),
             (of_goal, self.knots[None, -1], now.last.by_z[1:]),
         ]
         return sum_entries(parts, (count * d + of_goal.size, self.size))
 
-    def gradients(self, now: Iterate, multipliers: np.ndarray) -> np.ndarray:
+    def gradients(self, now: Evaluation, multipliers: np.ndarray) -> np.ndarray:
         """Return what each interval contributes to the gradient of `cost + multipliers @ residual`."""
-        count, d = self.knots.shape[0] - 1, self.knots.shape[1]
-        of_gaps = multipliers[: count * d].reshape(count, d)
-        weights = np.append(of_gaps, np.ones((count, 1)), axis=1)
-        by_end = np.einsum("kd,kde->ke", of_gaps, self._by_end(now))
-        by_end[-1] += np.append(1, multipliers[count * d :]) @ now.last.by_z
-        return np.append(np.einsum("kr,krp->kp", weights, now.ends.by_p), by_end, axis=1)
-
-    def _by_end(self, now: Iterate) -> np.ndarray:
-        return -np.einsum("knd,kne->kde", self._ends.bases, now.knots.by_z[1:])
+        of_gaps = multipliers[: now.gaps.size].reshape(now.gaps.shape)
+        by_start = np.einsum("kd,kdp->kp", of_gaps, now.by_start) + now.ends.by_p[:, -1]
+        by_end = np.einsum("kd,kde->ke", of_gaps, now.by_end)
+        by_end[-1] += np.append(1, multipliers[now.gaps.size :]) @ now.last.by_z
+        return np.append(by_start, by_end, axis=1)
 
     def recentered(self, v: np.ndarray) -> tuple["Transcription", np.ndarray, np.ndarray]:
         """Return the same with charts around the states at `v`, where these are, and the derivatives of the new
@@ -125,6 +133,21 @@ class Transcription:
         moved[: self.inputs[0, 0]] = 0
         new = Transcription(self.shooting, charts, self.knots, self.inputs, self.evaluations)
         return new, moved, turn
+
+
+def gaps_of(differences: np.ndarray, bases: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return differences of states `(K, n)` in tangent coordinates `(K, d)`, and the derivatives of these by the
+    differences. States on the far side of the manifold may have none along the tangent space: a difference that
+    is more than 45 degrees from it counts with its whole length."""
+    gaps = np.einsum("knd,kn->kd", bases, differences)
+    tangent, whole = (np.sum(x**2, axis=1) for x in (gaps, differences))
+    is_far = whole > 2 * tangent
+    tangent, whole = (np.where(is_far, np.maximum(x, 1e-300), 1) for x in (tangent, whole))
+    scale = np.where(is_far, np.sqrt(whole / (2 * tangent)), 1)[:, None]
+    along = np.einsum("knd,kd->kn", bases, gaps) / tangent[:, None]
+    change = scale * np.where(is_far[:, None], differences / whole[:, None] - along, 0)
+    slopes = scale[:, :, None] * np.swapaxes(bases, 1, 2) + gaps[:, :, None] * change[:, None, :]
+    return scale * gaps, slopes
 
 
 def sum_entries(parts: list[tuple[np.ndarray, ...]], shape: tuple[int, int]) -> sp.csr_array:

@@ -1,0 +1,104 @@
+"""The arguments of trajectory optimization, and the states from which it starts."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.flatten_util as jfu
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+
+from .._base.shapes import are_alike, shapes
+from .._base.types import Y
+from .._constraint.constraint import AbstractConstraint
+from .._constraint.project import consistent_state
+from .shooting import Knots, Shooting, solve_intervals
+
+
+_ON_MANIFOLD = 1e-6  # how far a goal may be from the manifold, relative to its size
+
+
+def checked_inputs(ts: Any, inputs: Any) -> tuple[np.ndarray, np.ndarray]:
+    ts, inputs = np.asarray(ts, float), np.asarray(inputs, float)
+    if ts.ndim != 1 or ts.size < 3 or not np.all(np.diff(ts) > 0):
+        raise ValueError(f"`ts` must be at least three increasing times, shape (K,), got {ts}.")
+    if inputs.ndim != 2 or inputs.shape[0] != ts.size or not np.all(np.isfinite(inputs)):
+        raise ValueError(
+            f"`inputs` must be finite and have the shape ({ts.size}, m) for m inputs, got {inputs.shape}."
+        )
+    return ts, inputs
+
+
+def checked_bounds(bounds: Any, m: int) -> np.ndarray:
+    """Return lower and upper bounds, shape `(2, m)`."""
+    if not isinstance(bounds, tuple | list) or len(bounds) != 2:
+        raise ValueError("`bounds` must be `(lower, upper)`, two numbers or arrays of shape (m,).")
+    shape = ", ".join(str(np.shape(side)) for side in bounds)
+    if any(np.shape(side) not in ((), (m,)) for side in bounds):
+        raise ValueError(f"`bounds` must be two numbers, or arrays of shape ({m},), got {shape}.")
+    limits = np.stack([np.broadcast_to(np.asarray(side, float), (m,)) for side in bounds])
+    if not np.all(limits[0] < limits[1]):
+        raise ValueError(f"`bounds`: each lower bound must be below the upper one, got {bounds}.")
+    return limits
+
+
+def check_number(name: str, function: Any, *args: Any) -> None:
+    if not callable(function):
+        raise TypeError(f"`{name}` must be a function, got {type(function).__name__}.")
+    out = eqx.filter_eval_shape(function, *args)
+    if getattr(out, "shape", None) != ():
+        raise ValueError(f"`{name}` must return one number, got {shapes(out)}.")
+
+
+def checked_goal(goal: Y, y0: Y, constraint: AbstractConstraint, t: Any, u: Any) -> Y:
+    if not are_alike(goal, y0):
+        raise ValueError(
+            f"`goal` must be a state like `y0`, of shapes {shapes(y0)}, or a function of a state; got {shapes(goal)}."
+        )
+    goal = jtu.tree_map(lambda a, b: jnp.asarray(a, b.dtype), goal, y0)
+    there, info = consistent_state(constraint, t, goal, u, throw=False)
+    if not bool(info.success) or not float(info.correction) <= _ON_MANIFOLD:
+        raise ValueError(
+            "`goal` is not on the manifold. Write `goal, _ = mj.consistent_state(constraint, ts[-1], goal)` if it is near."
+        )
+    return there
+
+
+def guess_states(
+    shooting: Shooting, ts: np.ndarray, y0: Y, u: np.ndarray, goal: Any, states: Any
+) -> np.ndarray:
+    """Return states on the manifold at all times, as vectors."""
+    first, unravel = jfu.ravel_pytree(y0)
+    last = None if goal is None else jfu.ravel_pytree(goal)[0]
+    if states is not None:
+        wanted = jtu.tree_map(lambda leaf: jnp.zeros((ts.size, *leaf.shape), leaf.dtype), y0)
+        if not are_alike(states, wanted):
+            raise ValueError(
+                f"`states` must have the shapes {shapes(wanted)}, got {shapes(states)}."
+            )
+        states = jax.vmap(lambda y: jfu.ravel_pytree(y)[0])(states)
+    found, x = [first], first
+    for k in range(1, ts.size):
+        if states is not None:
+            near = states[k]
+        elif last is not None:
+            near = x + (last - x) / (ts.size - k)
+        else:
+            start, pair = (
+                Knots(x[None], jnp.zeros((1, x.size, 0))),
+                jnp.asarray(u[None, k - 1 : k + 1]),
+            )
+            times = jnp.asarray(ts[None, k - 1 : k + 1])
+            near = solve_intervals(shooting, times, start, pair).reached[0, :-1]
+        y, info = consistent_state(shooting.constraint, ts[k], unravel(near), u[k], throw=False)
+        if not bool(info.success):
+            raise ValueError(
+                f"No guess of the state at t = {ts[k]:.6g} was found on the manifold. Give `states`, near to the manifold at "
+                "all of `ts`."
+            )
+        x = jfu.ravel_pytree(y)[0]
+        found.append(x)
+    if last is not None:
+        found[-1] = last
+    return np.stack(found)
