@@ -53,6 +53,7 @@ TOO_LONG = {
     "benchmarks.dae_board.steps",
     "benchmarks.peers.mechanisms_mujoco",
     "benchmarks.peers.neural",
+    "benchmarks.peers.optimal_control",
     "benchmarks.peers.robots",
     "benchmarks.peers.stiff",
     "benchmarks.speed.adaptive_gradients",

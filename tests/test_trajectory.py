@@ -66,7 +66,7 @@ def test_a_final_cost():
 
 
 def test_a_goal_that_is_a_function():
-    found = turn(goal=lambda y: y[1] - np.sin(1.5), tolerance=1e-9)
+    found = turn(goal=lambda y: y[1] - np.sin(1.5))
     np.testing.assert_allclose(found.inputs, 1.2 / 1.4, atol=1e-8)
 
 

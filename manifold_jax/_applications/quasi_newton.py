@@ -1,6 +1,6 @@
 """Minimization of a transcription: a trust-region method of SciPy with second derivatives in blocks."""
 
-from typing import Any
+from typing import Any, cast, NamedTuple
 
 import numpy as np
 import scipy.optimize as opt
@@ -14,6 +14,7 @@ from .transcription import Evaluation, sum_entries, Transcription
 _IN_THE_SAME_CHARTS = 50
 _FIRST_CURVATURE = 0.1
 _SMALL = 1e-8
+_CLOSED = 1e-8
 
 
 class BlockHessian:
@@ -59,46 +60,71 @@ class BlockHessian:
         self.transcription, self.before = transcription, None
 
 
+class Minimum(NamedTuple):
+    """The unknowns, with the transcription whose charts they belong to, and the largest residual; how many
+    iterations were made, and whether the cost falls no more."""
+
+    transcription: Transcription
+    v: np.ndarray
+    cost: float
+    residual: float
+    iterations: int
+    is_final: bool
+
+
 def minimize(
     transcription: Transcription,
     start: np.ndarray,
     bounds: np.ndarray,
     max_iterations: int,
     tolerance: float,
-) -> tuple[Transcription, opt.OptimizeResult]:
-    """Minimize the cost where the residual is zero and the inputs are within their bounds; return the
-    transcription with the last charts, too, and the number of all iterations in `nit`."""
-    hessian, iterations, v, before = BlockHessian(transcription), 0, start, np.inf
+) -> Minimum:
+    """Minimize the cost where the residual is zero and the inputs are within their bounds."""
+    hessian, T, v = BlockHessian(transcription), transcription, start
     options: dict[str, Any] = dict(initial_barrier_parameter=1e-2)
+    best, iterations = None, 0
     while True:
-        T, limit = transcription, min(_IN_THE_SAME_CHARTS, max_iterations - iterations)
-        none = sp.csr_array((T.size, T.size))
-        jacobian: Any = T.jacobian
-        closed = opt.NonlinearConstraint(T.residual, 0, 0, jac=jacobian, hess=hessian.at)
-        result = opt.minimize(
-            T.cost,
-            v,
-            jac=T.cost_gradient,
-            hess=lambda v, none=none: none,  # the cost is in that of the Lagrangian
-            method="trust-constr",
-            bounds=bounds,
-            constraints=closed,
-            options=dict(maxiter=limit, gtol=tolerance, xtol=1e-12, **options),
-        )
+        limit = min(_IN_THE_SAME_CHARTS, max_iterations - iterations)
+        result = _in_these_charts(T, hessian, v, bounds, dict(maxiter=limit, **options))
         iterations += result.nit
-        # Steps of which rounding leaves nothing are too small twice.
-        change, before = abs(result.fun - before), result.fun
-        still = result.status == 2 and change <= 1e-9 * (1 + abs(result.fun))
-        finished = result.status == 1 or still
-        if finished or iterations >= max_iterations:
-            result.nit = iterations
-            return T, result
-        transcription, v, turn = T.recentered(result.x)
-        hessian.turned(transcription, turn)
-        options = dict(
-            initial_tr_radius=max(result.tr_radius, 1e-3),
-            initial_constr_penalty=result.constr_penalty,
-        )
-        if "barrier_parameter" in result:  # not without bounds
-            options["initial_barrier_parameter"] = result.barrier_parameter
-            options["initial_barrier_tolerance"] = result.barrier_tolerance
+        found = Minimum(T, result.x, result.fun, result.constr_violation, iterations, False)
+        # The gradient may not become small: rounding, or bounds that only just bind.
+        if best is not None:
+            gain = best.cost - found.cost
+            if found.residual <= _CLOSED and gain <= tolerance * (1 + abs(best.cost)):
+                better = found if gain > 0 else best
+                return better._replace(iterations=iterations, is_final=True)
+        if result.status == 1 or iterations >= max_iterations:
+            return found._replace(is_final=result.status == 1)
+        best = found if found.residual <= _CLOSED else None
+        T, v, turn = T.recentered(result.x)
+        hessian.turned(T, turn)
+        options = _continued(result)
+
+
+def _in_these_charts(
+    T: Transcription, hessian: BlockHessian, v: np.ndarray, bounds: np.ndarray, options: Any
+) -> opt.OptimizeResult:
+    none, jacobian = sp.csr_array((T.size, T.size)), cast(Any, T.jacobian)
+    return opt.minimize(
+        T.cost,
+        v,
+        jac=T.cost_gradient,
+        hess=lambda v: none,  # the cost is in that of the Lagrangian
+        method="trust-constr",
+        bounds=bounds,
+        constraints=opt.NonlinearConstraint(T.residual, 0, 0, jac=jacobian, hess=hessian.at),
+        options=dict(gtol=_SMALL, xtol=1e-12, **options),
+    )
+
+
+def _continued(result: opt.OptimizeResult) -> dict[str, Any]:
+    """Return the options with which the next charts go on where the last ones have ended."""
+    options = dict(
+        initial_tr_radius=max(result.tr_radius, 1e-3),
+        initial_constr_penalty=result.constr_penalty,
+    )
+    if "barrier_parameter" in result:  # not without bounds
+        options["initial_barrier_parameter"] = result.barrier_parameter
+        options["initial_barrier_tolerance"] = result.barrier_tolerance
+    return options

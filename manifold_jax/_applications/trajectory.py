@@ -11,7 +11,6 @@ import jax.flatten_util as jfu
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-import scipy.optimize as opt
 from jaxtyping import Array, Bool, Float, Int
 
 from .._base.numbers import numbers_as_arrays
@@ -19,7 +18,7 @@ from .._base.types import FloatScalar, RealScalarLike, Y
 from .._constraint.checks import check_constraint_type, check_state
 from .._constraint.constraint import AbstractConstraint
 from .._constraint.project import consistent_state
-from .quasi_newton import minimize
+from .quasi_newton import minimize, Minimum
 from .shooting import Charts, Knots, Shooting, solve_intervals
 from .trajectory_arguments import (
     check_number,
@@ -78,8 +77,8 @@ def optimize_trajectory(
     states: Y | None = None,
     solver: dfx.AbstractSolver | None = None,
     steps: int = 4,
-    max_iterations: int = 500,
-    tolerance: float = 1e-8,
+    max_iterations: int = 1000,
+    tolerance: float = 1e-6,
     throw: bool = True,
 ) -> OptimalTrajectory:
     r"""Find the inputs `u(t)`, linear between given times, that minimize
@@ -115,7 +114,8 @@ def optimize_trajectory(
     - `solver`: an explicit solver of Diffrax, by default `Tsit5()`.
     - `steps`: how many equal steps are made in each interval, an even number. Look at `integration_error`:
         an optimizer finds the inputs for which a coarse solve is most wrong.
-    - `max_iterations`, `tolerance`: of the optimizer; `tolerance` is for the gradient of the Lagrangian.
+    - `max_iterations`, `tolerance`: of the optimizer, which ends where the gradient of the Lagrangian is zero, or the cost of
+        a motion does not fall by more than `tolerance`, relative to `1 + |cost|`, in fifty iterations.
     - `throw`: raise if no motion is found. Otherwise look at `success`.
 
     **Returns:** an [`OptimalTrajectory`][].
@@ -195,10 +195,10 @@ def _solved(
             f"The motion from t = {float(T.charts.ts[np.argmax(bad)]):.6g} on cannot be solved with the guessed states and inputs. "
             "Give other `states` or `inputs`, or more `steps`."
         )
-    T, result = minimize(T, v, bounds, max_iterations, tolerance)
-    v = np.clip(result.x, *bounds.T)
+    found = minimize(T, v, bounds, max_iterations, tolerance)
+    T, v = found.transcription, np.clip(found.v, *bounds.T)
     measured = _measured(T, v)
-    message = _message(result, *measured)
+    message = _message(found, measured)
     return OptimalTrajectory(
         ts=T.charts.ts,
         ys=jax.vmap(T.shooting.unravel)(jnp.asarray(T.at(v).knots.x)),
@@ -207,7 +207,7 @@ def _solved(
         gap=jnp.asarray(measured.gap),
         integration_error=jnp.asarray(measured.error),
         success=jnp.asarray(not message),
-        num_iterations=jnp.asarray(result.nit),
+        num_iterations=jnp.asarray(found.iterations),
         num_evaluations=jnp.asarray(T.evaluations),
         message=message,
     )
@@ -237,17 +237,23 @@ def _measured(T: Transcription, v: np.ndarray) -> Measured:
     return Measured(float(gaps[worst]), float(ts[worst + 1]), error)
 
 
-def _message(result: opt.OptimizeResult, gap: float, at: float, error: float) -> str:
+def _message(found: Minimum, measured: Measured) -> str:
     """Return what is wrong with a result, nothing if it can be used."""
-    residual = float(result.constr_violation)
-    if not max(gap, residual) <= _CLOSED:
+    apart = max(measured.gap, found.residual)
+    if not apart <= _CLOSED:
         return (
-            f"No motion was found: after {result.nit} iterations the parts of the motion are {max(gap, residual):.2g} apart, most at "
-            f"t = {at:.6g}. The goal may be out of reach within `bounds` and the time; otherwise give `states` or "
+            f"No motion was found: after {found.iterations} iterations the parts of the motion are {apart:.2g} apart, most at "
+            f"t = {measured.at:.6g}. The goal may be out of reach within `bounds` and the time; otherwise give `states` or "
             "`inputs` that are nearer to a motion, or more `max_iterations`."
         )
-    if not error <= _EXACT:
-        return f"The steps are too coarse: twice as many change the motion by {error:.2g}. Write more `steps`, or give more times."
-    if result.status not in (1, 2):
-        return f"The motion is possible, but its cost may still fall: {result.nit} iterations are made. Write more `max_iterations`."
+    if not measured.error <= _EXACT:
+        return (
+            f"The steps are too coarse: twice as many change the motion by {measured.error:.2g}. Write more `steps`, or give more "
+            "times."
+        )
+    if not found.is_final:
+        return (
+            f"The motion is possible, but its cost may still fall: {found.iterations} iterations are made. Write more "
+            "`max_iterations`."
+        )
     return ""
