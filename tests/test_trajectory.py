@@ -254,6 +254,7 @@ def test_gaps_of_states_on_the_far_side():
 @pytest.mark.parametrize(
     ("changed", "error", "message"),
     [
+        (dict(y0=np.float32([1.0, 0.0])), ValueError, "`y0` must be in double precision"),
         (dict(steps=3), ValueError, "`steps` must be an even number"),
         (dict(ts=TIMES[::-1]), ValueError, "`ts` must be at least three increasing"),
         (
@@ -285,6 +286,11 @@ def test_gaps_of_states_on_the_far_side():
 def test_bad_input(changed, error, message):
     with pytest.raises(error, match=message):
         turn(**changed)
+
+
+def test_terms_that_are_none():
+    with pytest.raises(TypeError, match="such as `system.terms`, got MechanicalSystem"):
+        mj.optimize_trajectory(BALL, BALL.constraint, TIMES, HANGING, np.zeros((5, 1)), cost=effort)
 
 
 def test_inside_jit():

@@ -15,13 +15,14 @@ from jaxtyping import Array, Bool, Float, Int
 
 from .._base.numbers import numbers_as_arrays
 from .._base.types import FloatScalar, RealScalarLike, Y
-from .._constraint.checks import check_constraint_type, check_state
+from .._constraint.checks import check_constraint_type
 from .._constraint.constraint import AbstractConstraint
 from .._constraint.project import consistent_state
 from .quasi_newton import minimize, Minimum
 from .shooting import Charts, Knots, Shooting, solve_intervals
 from .trajectory_arguments import (
     check_number,
+    check_setting,
     checked_bounds,
     checked_goal,
     checked_inputs,
@@ -64,7 +65,7 @@ class OptimalTrajectory(eqx.Module):
 
 @numbers_as_arrays("y0")
 def optimize_trajectory(
-    terms: dfx.ODETerm,
+    terms: Any,
     constraint: AbstractConstraint,
     ts: Any,
     y0: Y,
@@ -132,15 +133,9 @@ def optimize_trajectory(
     IEEE Trans. Robot. 39 (2023) 183-202 (charts at the knots).
     """
     check_constraint_type(constraint)
-    if any(isinstance(x, jax.core.Tracer) for x in jtu.tree_leaves((ts, y0, inputs))):
-        raise TypeError(
-            "`optimize_trajectory` calls SciPy: call it outside of `jit`, `vmap` and derivatives."
-        )
-    if not isinstance(steps, int) or steps < 2 or steps % 2:
-        raise ValueError(f"`steps` must be an even number of at least 2, got {steps!r}.")
+    check_setting(terms, ts, y0, inputs, steps)
     ts, u = checked_inputs(ts, inputs)
     limits = checked_bounds(bounds, u.shape[1])
-    check_state(y0, "y0")
     y0, _ = consistent_state(constraint, ts[0], jtu.tree_map(jnp.asarray, y0), u[0])
     check_number("cost", cost, ts[0], y0, u[0])
     if final_cost is not None:

@@ -2,8 +2,10 @@
 
 from typing import Any
 
+import diffrax as dfx
 import equinox as eqx
 import jax
+import jax.core
 import jax.flatten_util as jfu
 import jax.numpy as jnp
 import jax.tree_util as jtu
@@ -11,12 +13,31 @@ import numpy as np
 
 from .._base.shapes import are_alike, shapes
 from .._base.types import Y
+from .._constraint.checks import check_state
 from .._constraint.constraint import AbstractConstraint
 from .._constraint.project import consistent_state
 from .shooting import Knots, Shooting, solve_intervals
 
 
 _ON_MANIFOLD = 1e-6  # how far a goal may be from the manifold, relative to its size
+
+
+def check_setting(terms: Any, ts: Any, y0: Any, inputs: Any, steps: Any) -> None:
+    if not isinstance(terms, dfx.ODETerm):
+        raise TypeError(
+            f"`terms` must be a `diffrax.ODETerm` whose `args` are the inputs, such as `system.terms`, got {type(terms).__name__}."
+        )
+    if any(isinstance(x, jax.core.Tracer) for x in jtu.tree_leaves((ts, y0, inputs))):
+        raise TypeError(
+            "`optimize_trajectory` calls SciPy: call it outside of `jit`, `vmap` and derivatives."
+        )
+    if not isinstance(steps, int) or steps < 2 or steps % 2:
+        raise ValueError(f"`steps` must be an even number of at least 2, got {steps!r}.")
+    check_state(y0, "y0")
+    if any(jnp.result_type(leaf) != np.float64 for leaf in jtu.tree_leaves(y0)):
+        raise ValueError(
+            "`y0` must be in double precision, which optimizers need: `jax.config.update('jax_enable_x64', True)`."
+        )
 
 
 def checked_inputs(ts: Any, inputs: Any) -> tuple[np.ndarray, np.ndarray]:
