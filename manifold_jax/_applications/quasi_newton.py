@@ -93,6 +93,7 @@ def minimize(
             gain = best.cost - found.cost
             if found.residual <= _CLOSED and gain <= tolerance * (1 + abs(best.cost)):
                 better = found if gain > 0 else best
+                better.transcription.evaluations = T.evaluations
                 return better._replace(iterations=iterations, is_final=True)
         if result.status == 1 or iterations >= max_iterations:
             return found._replace(is_final=result.status == 1)
