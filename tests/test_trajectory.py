@@ -235,12 +235,14 @@ def test_new_charts_change_nothing():
 
 
 def test_gaps_of_states_on_the_far_side():
-    """The difference from the opposite point has no tangent part; the gap is nevertheless as long."""
+    """The difference from the opposite point has no tangent part; the gap is nevertheless as long, over the root of two."""
     random = np.random.default_rng(1)
     bases = np.linalg.qr(random.standard_normal((6, 5, 2)))[0]
     near = np.einsum("knd,kd->kn", bases, random.standard_normal((6, 2)))
     differences = near + 3 * (np.arange(6) > 2)[:, None] * random.standard_normal((6, 5))
     gaps, slopes = gaps_of(differences, bases)
+    across = np.linalg.qr(bases[0], mode="complete")[0][:, 2:].sum(axis=1)
+    assert np.linalg.norm(gaps_of(across[None], bases[:1])[0]) == pytest.approx(np.sqrt(1.5))
     length = np.linalg.norm(differences, axis=1)
     np.testing.assert_allclose(np.linalg.norm(gaps[:3], axis=1), length[:3])
     assert np.all(np.linalg.norm(gaps, axis=1) >= length / np.sqrt(2) - 1e-12)
@@ -288,9 +290,55 @@ def test_bad_input(changed, error, message):
         turn(**changed)
 
 
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        (dict(cost=lambda t, y, u: jnp.sqrt(u @ u)), "`cost` or its derivative is not finite"),
+        (
+            dict(goal=lambda y: jnp.sqrt(jnp.abs(y[0] - y[0])) * y[:1]),
+            "`final_cost` or `goal`, or the deriv",
+        ),
+        (
+            dict(goal=lambda y: y - on_circle(1.5)),
+            "`goal` returns 2 numbers that depend on each other",
+        ),
+        (dict(inputs=np.zeros((5, 0))), "`inputs` must be finite"),
+    ],
+)
+def test_a_guess_without_derivatives(changed, message):
+    """Comparisons with NaN would end the optimizer at once."""
+    with pytest.raises(ValueError, match=message):
+        turn(**changed)
+
+
+def test_a_cost_that_is_not_integrated():
+    """A narrow hill in the way, between the points of Simpson's rule."""
+    hill = lambda t, y, u: u @ u + 50 * jnp.exp(-(((t - 0.35) / 0.005) ** 2)) * y[0] ** 2
+    found = turn(cost=hill, throw=False)
+    assert "The steps are too coarse" in found.message
+
+
+def test_a_cost_at_the_end_alone():
+    found = turn(
+        cost=lambda t, y, u: 0.0, goal=None, final_cost=lambda y: -y[1], bounds=(-3.0, 3.0)
+    )
+    np.testing.assert_allclose(found.ys[-1], [0.0, 1.0], atol=1e-5)
+
+
 def test_terms_that_are_none():
     with pytest.raises(TypeError, match="such as `system.terms`, got MechanicalSystem"):
         mj.optimize_trajectory(BALL, BALL.constraint, TIMES, HANGING, np.zeros((5, 1)), cost=effort)
+
+
+def test_nothing_that_can_move():
+    fixed = mj.Constraint(lambda t, y, u: y - on_circle(0.3))
+    given = TIMES, on_circle(0.3), np.zeros((5, 1))
+    with pytest.raises(ValueError, match="nothing can move"):
+        mj.optimize_trajectory(TURNING, fixed, *given, cost=effort)
+    with pytest.raises(ValueError, match="`constraint` has no equations"):
+        mj.optimize_trajectory(
+            TURNING, mj.Constraint(lambda t, y, u: jnp.zeros(0)), *given, cost=effort
+        )
 
 
 def test_inside_jit():

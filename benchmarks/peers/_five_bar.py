@@ -1,7 +1,8 @@
 """A five-bar robot with a load, as bodies and joints, and its poses.
 
-The numbers are those of the robot in R. Bordalba's repository collocation_constrained_systems, file Scherbot2.m: two arms of
-two links from two motors to one joint with a load, in a vertical plane.
+The numbers are those of the robot in R. Bordalba's repository collocation_constrained_systems (Scherbot2.m, and for the
+largest torque run_fivebars_statistics.m): two arms of two links from two motors to one joint with a load, in a vertical
+plane.
 """
 
 from typing import Any, NamedTuple

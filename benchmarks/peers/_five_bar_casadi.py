@@ -17,12 +17,14 @@ DEGREE = 3
 
 
 class Collocated(NamedTuple):
-    """The result of IPOPT; `loop(t, x)` is what the closed loop is open, of polynomials between knots (m)."""
+    """The result of IPOPT: `again_s` are the seconds of iterations alone, `drift` the largest gap of the loop in the
+    polynomials (m)."""
 
     cost: float
     iterations: int
     build_s: float
     solve_s: float
+    again_s: float
     status: str
     inputs: np.ndarray
     drift: float
@@ -107,6 +109,7 @@ def solve(ts: np.ndarray, thetas: np.ndarray, rates: np.ndarray) -> Collocated:
         int(found.stats()["iter_count"]),
         middle - begin,
         end - middle,
+        float(found.stats()["t_wall_total"]),
         status,
         np.asarray(found.value(u)).T,
         drift,

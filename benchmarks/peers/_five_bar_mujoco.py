@@ -54,7 +54,7 @@ def replay(theta: np.ndarray, ts: np.ndarray, inputs: np.ndarray) -> tuple[np.nd
     for k in range(round(ts[-1] / STEP)):
         data.ctrl[:] = [np.interp((k + 0.5) * STEP, ts, u) for u in inputs.T]
         mujoco.mj_step(own, data)
+        mujoco.mj_kinematics(own, data)
         gap = data.site_xpos[tools[0]] - data.site_xpos[tools[1]]
         largest = max(largest, float(np.abs(gap).max()))
-    mujoco.mj_forward(own, data)
     return np.array(data.site_xpos[tools[0]][:2]), largest

@@ -33,9 +33,9 @@ LOW, HIGH, ACROSS = -0.33, -0.10, 0.06  # m: the tool
 
 @dataclasses.dataclass(frozen=True)
 class Row:
-    """`first_s` includes compiling, or building the program. `drift` is the largest gap of the loop in the optimizer's own
-    states and between them, `miss` how far from the goal the tool ends when the torques are repeated with small steps,
-    `miss_mujoco` and `gap_mujoco` the same in MuJoCo (all m)."""
+    """`first_s` includes compiling, or building the program. `drift` is the largest gap of the loop: for this library at
+    the times and when the motion is repeated, for CasADi in its polynomials. `miss` is how far from the goal the tool ends
+    when the torques are repeated with small steps; `miss_mujoco` and `gap_mujoco` are those of MuJoCo (all m)."""
 
     method: str
     status: str
@@ -59,6 +59,10 @@ def path() -> tuple[np.ndarray, np.ndarray]:
     return ts, np.unwrap(thetas, axis=0)
 
 
+def effort(t: Any, y: Any, u: Any) -> Any:
+    return u @ u
+
+
 class Task:
     """The robot at its start, whose inputs are its torques, and its goal."""
 
@@ -79,7 +83,7 @@ class Task:
             self.ts,
             self.start,
             np.zeros((self.ts.size, 2)),
-            cost=lambda t, y, u: u @ u,
+            cost=effort,
             goal=self.goal,
             bounds=(-robot.MOST, robot.MOST),
             states=self.states,
@@ -156,7 +160,7 @@ def casadi(task: Task) -> tuple[Row, dfx.Solution] | None:
         make_console().print("CasADi is not installed (extra `peers`): skipped.")
         return None
     values, motion = measured(task, found.inputs)
-    counts = found.cost, found.iterations, found.build_s + found.solve_s, found.solve_s
+    counts = found.cost, found.iterations, found.build_s + found.solve_s, found.again_s
     return Row("CasADi, IPOPT", found.status, *counts, drift=found.drift, **values), motion
 
 

@@ -47,13 +47,14 @@ class BlockHessian:
         rest = change - np.einsum("kij,kj->ki", self.blocks, step)
         product = np.sum(rest * step, axis=1)
         sizes = np.linalg.norm(rest, axis=1) * np.linalg.norm(step, axis=1)
-        safe = np.abs(product) > _SMALL * sizes
-        product = np.where(safe, product, np.inf)
+        safe = np.isfinite(product) & (np.abs(product) > _SMALL * sizes)
+        rest = np.where(safe[:, None], rest, 0)
+        product = np.where(safe, product, 1)
         self.blocks += rest[:, :, None] * rest[:, None, :] / product[:, None, None]
 
     def turned(self, transcription: Transcription, turn: np.ndarray) -> None:
         """Go on in other coordinates of the knots."""
-        d, back = turn.shape[1], np.linalg.inv(turn)
+        d, back = turn.shape[1], np.linalg.pinv(turn)
         change = np.tile(np.eye(self.blocks.shape[1]), (self.blocks.shape[0], 1, 1))
         change[:, :d, :d], change[:, -d:, -d:] = back[:-1], back[1:]
         self.blocks = np.swapaxes(change, 1, 2) @ self.blocks @ change
@@ -88,16 +89,17 @@ def minimize(
         result = _in_these_charts(T, hessian, v, bounds, dict(maxiter=limit, **options))
         iterations += result.nit
         found = Minimum(T, result.x, result.fun, result.constr_violation, iterations, False)
+        is_closed = found.residual <= _CLOSED and np.isfinite(result.optimality)
         # The gradient may not become small: rounding, or bounds that only just bind.
-        if best is not None:
-            gain = best.cost - found.cost
-            if found.residual <= _CLOSED and gain <= tolerance * (1 + abs(best.cost)):
-                better = found if gain > 0 else best
-                better.transcription.evaluations = T.evaluations
-                return better._replace(iterations=iterations, is_final=True)
-        if result.status == 1 or iterations >= max_iterations:
-            return found._replace(is_final=result.status == 1)
-        best = found if found.residual <= _CLOSED else None
+        is_whole = result.status == 2 or result.nit >= _IN_THE_SAME_CHARTS
+        gain = np.inf if best is None else best.cost - found.cost
+        stalls = is_closed and is_whole and gain <= tolerance * (1 + abs(found.cost))
+        if is_closed and gain > 0:
+            best = found
+        if result.status == 1 or stalls or iterations >= max_iterations:
+            chosen = found if best is None or result.status == 1 else best
+            chosen.transcription.evaluations = T.evaluations
+            return chosen._replace(iterations=iterations, is_final=result.status == 1 or stalls)
         T, v, turn = T.recentered(result.x)
         hessian.turned(T, turn)
         options = _continued(result)

@@ -69,7 +69,8 @@ class Shooting(eqx.Module):
             throw=False,
             consistent="assume",
         )
-        rates = jax.vmap(lambda t, y: self.cost(t, y, field.at(t)))(ts, sol.ys)
+        rate = lambda t, y: jnp.asarray(self.cost(t, y, field.at(t)), ts.dtype)
+        rates = jax.vmap(rate)(ts, sol.ys)
         weights = np.array([1, *[4, 2] * (self.steps // 2 - 1), 4, 1]) / 3
         cost = (ts[1] - ts[0]) * (weights @ rates)
         end = jfu.ravel_pytree(jtu.tree_map(lambda leaf: leaf[-1], sol.ys))[0]
@@ -86,19 +87,22 @@ class Shooting(eqx.Module):
 
 
 class Charts(NamedTuple):
-    """Tangent coordinates at `K` knots: `z` stands for the state nearest to `center + basis z`."""
+    """Tangent coordinates at `K` knots: `z` stands for `center + basis z`, corrected onto the manifold."""
 
     ts: Float[Array, " K"]
     centers: Float[Array, "K n"]
     bases: Float[Array, "K n d"]
 
     @staticmethod
-    def around(shooting: Shooting, ts: Any, xs: Any, us: Any) -> "Charts":
-        """Return charts around states on the manifold. `d` is the dimension of the manifold."""
+    def around(
+        shooting: Shooting, ts: Any, xs: Any, us: Any, dimension: int | None = None
+    ) -> "Charts":
+        """Return charts around states on the manifold, whose dimension is found if it is not given."""
         given = map(jnp.asarray, (ts, xs, us))
         _, sizes, right = np.linalg.svd(np.asarray(shooting.jacobians(*given)))
         independent = sizes > _DEPENDENT * sizes.max(axis=1, initial=0, keepdims=True)
         rank = int(independent.sum(axis=1).max(initial=0))
+        rank = rank if dimension is None else right.shape[1] - dimension
         bases = np.swapaxes(right[:, rank:], 1, 2)
         return Charts(*map(jnp.asarray, (ts, xs, bases)))
 

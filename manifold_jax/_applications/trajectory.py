@@ -1,7 +1,6 @@
 """Optimal control on a manifold: the inputs for a motion, by multiple shooting."""
 
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import diffrax as dfx
 import equinox as eqx
@@ -15,12 +14,13 @@ from jaxtyping import Array, Bool, Float, Int
 
 from .._base.numbers import numbers_as_arrays
 from .._base.types import FloatScalar, RealScalarLike, Y
-from .._constraint.checks import check_constraint_type
+from .._constraint.checks import check_constraint_type, has_no_equations
 from .._constraint.constraint import AbstractConstraint
 from .._constraint.project import consistent_state
-from .quasi_newton import minimize, Minimum
-from .shooting import Charts, Knots, Shooting, solve_intervals
+from .quasi_newton import minimize
+from .shooting import Charts, Shooting
 from .trajectory_arguments import (
+    check_guess,
     check_number,
     check_setting,
     checked_bounds,
@@ -28,10 +28,8 @@ from .trajectory_arguments import (
     checked_inputs,
     guess_states,
 )
+from .trajectory_quality import measure, message_of
 from .transcription import Transcription
-
-
-_CLOSED, _EXACT = 1e-6, 1e-3  # largest gaps and integration errors of a motion that is found
 
 
 class OptimalTrajectory(eqx.Module):
@@ -43,8 +41,10 @@ class OptimalTrajectory(eqx.Module):
     - `ts`, `ys`, `inputs`: the motion at the `K` times, all states on the manifold.
     - `cost`: the integral and the final cost.
     - `gap`: the largest difference of a state from the end of the interval before it, relative to `|y| + 1`.
-    - `integration_error`: by how much the end of an interval changes with twice as many steps, in the same way.
-    - `success`, and `message`, which says what is wrong.
+    - `integration_error`: by how much the end of an interval changes with twice as many steps, in the same way, or
+        the integral of the cost, relative to `1 + |cost|`; whichever is larger.
+    - `success`: gaps and goal are closed to 1e-6, `integration_error` is below 1e-3, and the optimizer has ended.
+        Otherwise `message` says what is wrong.
     - `num_iterations`, `num_evaluations`: of the optimizer, and how often all intervals were solved.
     """
 
@@ -104,10 +104,11 @@ def optimize_trajectory(
     - `constraint`: the manifold, which does not depend on the inputs.
     - `ts`: the `K` times, increasing; about as many as are needed to draw the motion by hand.
     - `y0`: the first state, made consistent.
-    - `inputs`: a guess of the inputs, shape `(K, m)`; zeros do.
+    - `inputs`: a guess of the inputs, shape `(K, m)`, clipped to `bounds`; zeros often do.
     - `cost`: `c(t, y, u)`, one number; its integral is that of Simpson's rule.
     - `final_cost`: `c_1(y)`, one number.
-    - `goal`: the last state, on the manifold; or a function of it that returns an array of what must be zero.
+    - `goal`: the last state, on the manifold; or a function of it that returns an array of what must be
+        zero: numbers that are independent on the manifold.
     - `bounds`: lower and upper bounds of the inputs, numbers or of shape `(m,)`; infinite without.
     - `states`: a guess of the states, with a leading axis of `K`; by default on the way from `y0` straight
         to the goal, or without a state as goal those of the guessed inputs. For a motion that has to
@@ -116,7 +117,7 @@ def optimize_trajectory(
     - `steps`: how many equal steps are made in each interval, an even number. Look at `integration_error`:
         an optimizer finds the inputs for which a coarse solve is most wrong.
     - `max_iterations`, `tolerance`: of the optimizer, which ends where the gradient of the Lagrangian is zero, or the cost of
-        a motion does not fall by more than `tolerance`, relative to `1 + |cost|`, in fifty iterations.
+        a motion does not fall by more than `tolerance`, relative to `1 + |cost|`, in some fifty iterations.
     - `throw`: raise if no motion is found. Otherwise look at `success`.
 
     **Returns:** an [`OptimalTrajectory`][].
@@ -126,7 +127,7 @@ def optimize_trajectory(
     are too coarse.
 
     The solution is a local minimum. The optimizer is SciPy's `trust-constr`, with first derivatives in forward
-    mode; for hundreds of states or times, or bounds on states, write the equations in CasADi for IPOPT. Not
+    mode and second ones from updates; for hundreds of states or times, or bounds on states, write the equations in CasADi for IPOPT. Not
     inside `jit`. Feedback along the motion: [`regulate`][].
 
     Source: Bock & Plitt, IFAC Proc. 17 (1984) 1603-1608 (multiple shooting); Bordalba, Schoels, Ros, Porta & Diehl,
@@ -136,6 +137,10 @@ def optimize_trajectory(
     check_setting(terms, ts, y0, inputs, steps)
     ts, u = checked_inputs(ts, inputs)
     limits = checked_bounds(bounds, u.shape[1])
+    if has_no_equations(constraint, ts[0], y0, u[0]):
+        raise ValueError(
+            "`constraint` has no equations. Write one that the states satisfy, such as `mj.Constraint(g)`."
+        )
     y0, _ = consistent_state(constraint, ts[0], jtu.tree_map(jnp.asarray, y0), u[0])
     check_number("cost", cost, ts[0], y0, u[0])
     if final_cost is not None:
@@ -152,12 +157,16 @@ def optimize_trajectory(
         constraint,
         dfx.Tsit5() if solver is None else solver,
         cost,
-        _last(final_cost, None if is_state else goal),
+        _Last(final_cost, None if is_state else goal),
         jfu.ravel_pytree(y0)[1],
         steps,
     )
     guess = guess_states(shooting, ts, y0, u, goal if is_state else None, states)
     charts = Charts.around(shooting, ts, guess, u)
+    if charts.bases.shape[2] == 0:
+        raise ValueError(
+            "`constraint` has as many independent equations as `y0` has numbers: nothing can move."
+        )
     transcription = Transcription.of(shooting, charts, u.shape[1], ends_free=not is_state)
     found = _solved(transcription, u, limits, max_iterations, tolerance)
     if throw and not found.success:
@@ -165,13 +174,16 @@ def optimize_trajectory(
     return found
 
 
-def _last(final_cost: Any, goal: Any) -> Callable[[Y], Array]:
-    def last(y: Y) -> Array:
-        value = jnp.zeros(()) if final_cost is None else final_cost(y)
-        rest = jnp.zeros(0) if goal is None else jnp.atleast_1d(goal(y))
-        return jnp.append(value, rest)
+class _Last(eqx.Module):
+    """The final cost and the residual of the goal, as one vector. A module, so that it is compiled once."""
 
-    return last
+    final_cost: Any
+    goal: Any
+
+    def __call__(self, y: Y) -> Float[Array, " r"]:
+        value = jnp.zeros(()) if self.final_cost is None else self.final_cost(y)
+        rest = jnp.zeros(0) if self.goal is None else jnp.atleast_1d(self.goal(y))
+        return jnp.append(jnp.asarray(value, float), rest)
 
 
 def _solved(
@@ -184,16 +196,11 @@ def _solved(
     T, v = transcription, np.zeros(transcription.size)
     bounds = np.tile([-np.inf, np.inf], (T.size, 1))
     v[T.inputs], bounds[T.inputs] = np.clip(u, *limits), limits.T
-    bad = ~np.isfinite(T.at(v).ends.reached).all(axis=1)
-    if bad.any():
-        raise ValueError(
-            f"The motion from t = {float(T.charts.ts[np.argmax(bad)]):.6g} on cannot be solved with the guessed states and inputs. "
-            "Give other `states` or `inputs`, or more `steps`."
-        )
+    check_guess(np.asarray(T.charts.ts), T.at(v))
     found = minimize(T, v, bounds, max_iterations, tolerance)
     T, v = found.transcription, np.clip(found.v, *bounds.T)
-    measured = _measured(T, v)
-    message = _message(found, measured)
+    measured = measure(T, v)
+    message = message_of(found, measured)
     return OptimalTrajectory(
         ts=T.charts.ts,
         ys=jax.vmap(T.shooting.unravel)(jnp.asarray(T.at(v).knots.x)),
@@ -206,49 +213,3 @@ def _solved(
         num_evaluations=jnp.asarray(T.evaluations),
         message=message,
     )
-
-
-class Measured(NamedTuple):
-    """How well the intervals fit together, where they do least, and how well they are solved."""
-
-    gap: float
-    at: float
-    error: float
-
-
-def _measured(T: Transcription, v: np.ndarray) -> Measured:
-    now, ts, u = T.at(v), np.asarray(T.charts.ts), T.at(v).u
-    size, coarse = 1 + np.abs(now.knots.x).max(), now.ends.reached[:, :-1]
-    gaps = np.abs(coarse - now.knots.x[1:]).max(axis=1) / size
-    middle, between = (ts[1:] + ts[:-1]) / 2, (u[1:] + u[:-1]) / 2
-    halves = ((ts[:-1], middle), (u[:-1], between)), ((middle, ts[1:]), (between, u[1:]))
-    x, by_z = now.knots.x[:-1], jnp.asarray(now.knots.by_z[:-1])
-    for times, inputs in halves:
-        times, pairs = (jnp.asarray(np.stack(pair, axis=1)) for pair in (times, inputs))
-        ends = solve_intervals(T.shooting, times, Knots(jnp.asarray(x), by_z), pairs)
-        x = np.asarray(ends.reached[:, :-1])
-    error = float(np.abs(x - coarse).max() / size)
-    worst = int(np.argmax(np.nan_to_num(gaps, nan=np.inf)))
-    return Measured(float(gaps[worst]), float(ts[worst + 1]), error)
-
-
-def _message(found: Minimum, measured: Measured) -> str:
-    """Return what is wrong with a result, nothing if it can be used."""
-    apart = max(measured.gap, found.residual)
-    if not apart <= _CLOSED:
-        return (
-            f"No motion was found: after {found.iterations} iterations the parts of the motion are {apart:.2g} apart, most at "
-            f"t = {measured.at:.6g}. The goal may be out of reach within `bounds` and the time; otherwise give `states` or "
-            "`inputs` that are nearer to a motion, or more `max_iterations`."
-        )
-    if not measured.error <= _EXACT:
-        return (
-            f"The steps are too coarse: twice as many change the motion by {measured.error:.2g}. Write more `steps`, or give more "
-            "times."
-        )
-    if not found.is_final:
-        return (
-            f"The motion is possible, but its cost may still fall: {found.iterations} iterations are made. Write more "
-            "`max_iterations`."
-        )
-    return ""

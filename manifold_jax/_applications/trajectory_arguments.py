@@ -17,6 +17,7 @@ from .._constraint.checks import check_state
 from .._constraint.constraint import AbstractConstraint
 from .._constraint.project import consistent_state
 from .shooting import Knots, Shooting, solve_intervals
+from .transcription import Evaluation
 
 
 _ON_MANIFOLD = 1e-6  # how far a goal may be from the manifold, relative to its size
@@ -44,7 +45,8 @@ def checked_inputs(ts: Any, inputs: Any) -> tuple[np.ndarray, np.ndarray]:
     ts, inputs = np.asarray(ts, float), np.asarray(inputs, float)
     if ts.ndim != 1 or ts.size < 3 or not np.all(np.diff(ts) > 0):
         raise ValueError(f"`ts` must be at least three increasing times, shape (K,), got {ts}.")
-    if inputs.ndim != 2 or inputs.shape[0] != ts.size or not np.all(np.isfinite(inputs)):
+    is_table = inputs.ndim == 2 and inputs.shape[0] == ts.size and inputs.size > 0
+    if not is_table or not np.all(np.isfinite(inputs)):
         raise ValueError(
             f"`inputs` must be finite and have the shape ({ts.size}, m) for m inputs, got {inputs.shape}."
         )
@@ -68,7 +70,7 @@ def check_number(name: str, function: Any, *args: Any) -> None:
     if not callable(function):
         raise TypeError(f"`{name}` must be a function, got {type(function).__name__}.")
     out = eqx.filter_eval_shape(function, *args)
-    if getattr(out, "shape", None) != ():
+    if getattr(out, "shape", np.shape(out) if isinstance(out, int | float) else None) != ():
         raise ValueError(f"`{name}` must return one number, got {shapes(out)}.")
 
 
@@ -84,6 +86,38 @@ def checked_goal(goal: Y, y0: Y, constraint: AbstractConstraint, t: Any, u: Any)
             "`goal` is not on the manifold. Write `goal, _ = mj.consistent_state(constraint, ts[-1], goal)` if it is near."
         )
     return there
+
+
+def check_guess(ts: np.ndarray, now: Evaluation) -> None:
+    """Refuse a guess from which no optimizer can start, and say why."""
+    ends, last = now.ends, now.last
+    is_finite = lambda *parts: np.all(
+        [np.isfinite(x).all(axis=tuple(range(1, x.ndim))) for x in parts], axis=0
+    )
+    solved = is_finite(ends.reached[:, :-1], ends.by_p[:, :-1])
+    if not solved.all():
+        raise ValueError(
+            f"The motion from t = {ts[np.argmin(solved)]:.6g} on, or its derivative, is not finite with the guessed states and "
+            "inputs. Give other `states` or `inputs`, or more `steps`; a norm has no derivative at zero."
+        )
+    if not is_finite(ends.reached[:, -1:], ends.by_p[:, -1:]).all():
+        raise ValueError(
+            "`cost` or its derivative is not finite with the guessed states and inputs. A norm has no derivative at zero: square "
+            "it, or give other `inputs`."
+        )
+    if not is_finite(last.values, last.by_z).all():
+        raise ValueError(
+            "`final_cost` or `goal`, or the derivative of one of them, is not finite at the last of the guessed `states`."
+        )
+    slopes = last.by_z[1:]
+    if (
+        slopes.size
+        and np.linalg.matrix_rank(slopes, tol=1e-9 * np.abs(slopes).max()) < slopes.shape[0]
+    ):
+        raise ValueError(
+            f"`goal` returns {slopes.shape[0]} numbers that depend on each other on the manifold, at the last of the guessed "
+            "`states`. Return independent ones, or give the state that is the goal."
+        )
 
 
 def guess_states(

@@ -127,7 +127,8 @@ class Transcription:
         """Return the same with charts around the states at `v`, where these are, and the derivatives of the new
         coordinates by the old ones, `(K, d, d)`."""
         now = self.at(v)
-        charts = Charts.around(self.shooting, self.charts.ts, now.knots.x, now.u)
+        given = self.shooting, self.charts.ts, now.knots.x, now.u
+        charts = Charts.around(*given, dimension=self.knots.shape[1])
         turn = np.einsum("knd,kne->kde", charts.bases, now.knots.by_z)
         moved = v.copy()
         moved[: self.inputs[0, 0]] = 0
@@ -138,8 +139,10 @@ class Transcription:
 def gaps_of(differences: np.ndarray, bases: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return differences of states `(K, n)` in tangent coordinates `(K, d)`, and the derivatives of these by the
     differences. States on the far side of the manifold may have none along the tangent space: a difference that
-    is more than 45 degrees from it counts with its whole length."""
+    is more than 45 degrees from it counts with its length, over the root of two."""
     gaps = np.einsum("knd,kn->kd", bases, differences)
+    tangent, whole = (np.sum(x**2, axis=1) for x in (gaps, differences))
+    gaps[:, 0] += np.where(tangent < 1e-12 * whole, 1e-6 * np.sqrt(whole), 0)  # any direction
     tangent, whole = (np.sum(x**2, axis=1) for x in (gaps, differences))
     is_far = whole > 2 * tangent
     tangent, whole = (np.where(is_far, np.maximum(x, 1e-300), 1) for x in (tangent, whole))
