@@ -312,10 +312,13 @@ def test_a_guess_without_derivatives(changed, message):
 
 
 def test_a_cost_that_is_not_integrated():
-    """A narrow hill in the way, between the points of Simpson's rule."""
+    """A narrow hill in the way, and numbers that are NaN, between the points of Simpson's rule."""
     hill = lambda t, y, u: u @ u + 50 * jnp.exp(-(((t - 0.35) / 0.005) ** 2)) * y[0] ** 2
-    found = turn(cost=hill, throw=False)
-    assert "The steps are too coarse" in found.message
+    hole = lambda t, y, u: jnp.where(jnp.abs(t - 0.025) < 0.01, jnp.nan, u @ u)
+    for cost in (hill, hole):
+        found = turn(cost=cost, throw=False)
+        assert "The steps are too coarse" in found.message
+        assert not found.success
 
 
 def test_a_cost_at_the_end_alone():

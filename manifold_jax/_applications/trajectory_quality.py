@@ -24,6 +24,7 @@ class Measured(NamedTuple):
 
 
 def measure(T: Transcription, v: np.ndarray) -> Measured:
+    """Solve each interval again with twice as many steps, as two halves."""
     now, ts, u = T.at(v), np.asarray(T.charts.ts), T.at(v).u
     size, coarse = 1 + np.abs(now.knots.x).max(), now.ends.reached[:, :-1]
     gaps = np.abs(coarse - now.knots.x[1:]).max(axis=1) / size
@@ -35,7 +36,8 @@ def measure(T: Transcription, v: np.ndarray) -> Measured:
         ends = solve_intervals(T.shooting, times, Knots(jnp.asarray(x), by_z), pairs)
         x, cost = np.asarray(ends.reached[:, :-1]), cost + np.asarray(ends.reached[:, -1]).sum()
     coarse_cost = now.ends.reached[:, -1].sum()
-    error = max(np.abs(x - coarse).max() / size, abs(cost - coarse_cost) / (1 + abs(cost)))
+    errors = np.abs(x - coarse).max() / size, abs(cost - coarse_cost) / (1 + abs(cost))
+    error = np.max(errors)  # NaN if one is
     worst = int(np.argmax(np.nan_to_num(gaps, nan=np.inf)))
     miss = float(np.abs(now.last.values[1:]).max(initial=0))
     return Measured(float(gaps[worst]), float(ts[worst + 1]), miss, float(error))
