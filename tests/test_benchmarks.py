@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 import jax
+import numpy as np
 import pytest
 
 
@@ -116,3 +117,18 @@ def test_runs(name, tmp_path, capsys):
         importlib.import_module(name).main(json=file, **SMALLEST[name])
     assert capsys.readouterr().out.strip()
     assert json.loads(file.read_text())["environment"]["versions"]["jax"] == jax.__version__
+
+
+@pytest.mark.parametrize("name", ["brusselator", "ladder"])
+def test_jacobian_of_sparse_problems(name):
+    """IDA and SciPy get it, and a wrong one would only cost them steps."""
+    problem = getattr(importlib.import_module("benchmarks.speed._sparse_problems"), name)(4)
+    y = np.random.default_rng(0).normal(size=problem.y0.shape)
+    rates = lambda y: problem.rates(0.3, y, problem.parameter, np).ravel()
+    written = np.zeros((y.size, y.size))
+    for rows, columns, values in problem.jacobian(y, problem.parameter):
+        written[rows, columns] = values
+    for k, unit in enumerate(np.eye(y.size)):
+        shift = 1e-6 * unit.reshape(y.shape)
+        difference = (rates(y + shift) - rates(y - shift)) / 2e-6
+        np.testing.assert_allclose(written[:, k], difference, rtol=1e-7, atol=1e-6)
