@@ -38,15 +38,15 @@ def processor_time() -> float:
     return time.process_time() + sum(os.times()[2:4])
 
 
-def peers(problem: Problem, tolerance: float, console: Console) -> dict[str, Prepared]:
-    """Those that are installed; for the others there is a message."""
+def peers(problem: Problem, tolerance: float) -> dict[str, Prepared]:
+    """Those that are installed."""
     found = {
         f"SciPy {method}": with_scipy(problem, method, tolerance) for method in ("BDF", "Radau")
     }
-    if _installed("sksundae", console):
+    if _installed("sksundae"):
         found["scikit-sundae IDA"] = with_sundae(problem, tolerance, exact=True)
         found["scikit-sundae IDA, differences"] = with_sundae(problem, tolerance, exact=False)
-    if _installed("casadi", console):
+    if _installed("casadi"):
         found["CasADi IDAS"] = with_casadi(problem, tolerance, {})
         if shutil.which("gcc"):
             compiled = {"jit": True, "compiler": "shell", "jit_options": {"flags": ["-O1"]}}
@@ -54,11 +54,14 @@ def peers(problem: Problem, tolerance: float, console: Console) -> dict[str, Pre
     return found
 
 
-def _installed(module: str, console: Console) -> bool:
-    found = importlib.util.find_spec(module) is not None
-    if not found:
-        console.print(f"{module}: skipped. It is missing: `pip install '.[peers]'`")
-    return found
+def report_missing(console: Console) -> None:
+    for module in ("sksundae", "casadi"):
+        if not _installed(module):
+            console.print(f"{module}: skipped. It is missing: `pip install '.\\[peers]'`")
+
+
+def _installed(module: str) -> bool:
+    return importlib.util.find_spec(module) is not None
 
 
 def with_scipy(problem: Problem, method: str, tolerance: float) -> Prepared:

@@ -20,7 +20,6 @@ import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
 import typer
-from rich.console import Console
 from rich.table import Table
 
 import manifold_jax as mj
@@ -33,7 +32,7 @@ from ..tools.measure import (
     use_one_core,
     write_json,
 )
-from ._sparse_peers import peers, Prepared, processor_time, T1, with_scipy
+from ._sparse_peers import peers, Prepared, processor_time, report_missing, T1, with_scipy
 from ._sparse_problems import brusselator, ladder, Problem
 
 
@@ -87,14 +86,14 @@ def ours(problem: Problem, structure: str) -> tuple[Prepared, Callable, dict[str
     return solved, lambda: jax.block_until_ready(gradient(a)), known
 
 
-def measure(problem: Problem, repeats: int, console: Console) -> list[dict[str, Any]]:
+def measure(problem: Problem, repeats: int) -> list[dict[str, Any]]:
     size = problem.y0.size
     reference, _ = with_scipy(problem, "Radau", TOLERANCE / 100).run()
     methods, gradients, rows = {}, {}, {}
     for structure in ("sparse", "dense") if size <= DENSE else ("sparse",):
         name = f"Rodas5P, {structure}"
         methods[name], gradients[name], rows[name] = ours(problem, structure)
-    methods |= peers(problem, TOLERANCE, console)
+    methods |= peers(problem, TOLERANCE)
     seconds = {
         name: timing.median_ms / 1e3
         for name, timing in interleaved({k: m.run for k, m in methods.items()}, repeats).items()
@@ -176,10 +175,11 @@ def main(
     use_one_core()
     use_double_precision()
     console = make_console()
+    report_missing(console)
     rows = []
     for make in (brusselator, ladder):
         for size in sizes.split(","):
-            rows += measure(make(int(size) // 2), repeats, console)
+            rows += measure(make(int(size) // 2), repeats)
     console.print(make_table(rows))
     console.print(f"slopes: {slopes(rows)}")
     if json is not None:
