@@ -19,6 +19,10 @@ if tuple(map(int, importlib.metadata.version("jaxlib").split(".")[:2])) < (0, 11
     OPTIONS["xla_cpu_use_fusion_emitters"] = (False, True)
 
 FAST_FLAGS = " ".join(f"--{name}={str(fast).lower()}" for name, (fast, _) in OPTIONS.items())
+# For programs that run for as long as they compile: half of the time for compiling, nearly the speed.
+MEDIUM_FLAGS = "--xla_backend_optimization_level=1"
+if "xla_cpu_use_fusion_emitters" in OPTIONS:
+    MEDIUM_FLAGS += " --xla_cpu_use_fusion_emitters=false"
 
 optimized_jit = functools.partial(
     jax.jit, compiler_options={name: usual for name, (_, usual) in OPTIONS.items()}

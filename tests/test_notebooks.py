@@ -5,12 +5,16 @@ from pathlib import Path
 import nbclient
 import nbformat
 import pytest
+from optimized import MEDIUM_FLAGS
 
 
 NOTEBOOKS = sorted(Path(__file__).parents[1].glob("notebooks/*.ipynb"))
 
 # They compile for long and run shortly, so that the flags of the tests, without optimization, take half the time.
 COMPILED_FOR_LONG = ("08_from", "13_from", "14_the")
+
+# They run for long, too: the flags between those of the tests and those of a reader.
+COMPILED_AND_RUN_FOR_LONG = ("10_calibration",)
 
 notebooks = pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 
@@ -44,7 +48,9 @@ def test_is_short_and_saved_with_its_output(path):
 @notebooks
 def test_runs_in_a_fresh_kernel(path, tmp_path, monkeypatch):
     # As a reader runs it: code compiled without optimization is too slow for ten thousand pendulums.
-    if not path.stem.startswith(COMPILED_FOR_LONG):
+    if path.stem.startswith(COMPILED_AND_RUN_FOR_LONG):
+        monkeypatch.setenv("XLA_FLAGS", MEDIUM_FLAGS)
+    elif not path.stem.startswith(COMPILED_FOR_LONG):
         monkeypatch.delenv("XLA_FLAGS", raising=False)
     notebook = nbformat.read(path, as_version=4)
     client = nbclient.NotebookClient(
