@@ -55,6 +55,7 @@ TOO_LONG = {
     "benchmarks.peers.mechanisms_mujoco",
     "benchmarks.peers.neural",
     "benchmarks.peers.optimal_control",
+    "benchmarks.peers.power_grid",
     "benchmarks.peers.robots",
     "benchmarks.peers.stiff",
     "benchmarks.speed.adaptive_gradients",
