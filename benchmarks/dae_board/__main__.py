@@ -245,7 +245,7 @@ def main(
             made[name] = made[name]._replace(solver=solver)
     for name, title in PEERS.items():
         if not quick and name not in installed():
-            console.print(f"{title}: skipped. It needs {name}: `pip install '.[peers]'`")
+            console.print(f"{title}: skipped. It needs {name}: `pip install '.\\[peers]'`")
     every = _rows_in(json) if problems else {}
     for name in names:
         every[name] = measure(name, made[name], repeats, quick)

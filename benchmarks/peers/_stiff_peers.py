@@ -30,7 +30,7 @@ def peers(problem: StiffProblem, console: Console) -> dict[str, Callable[[], Any
         if not possible:
             continue
         if importlib.util.find_spec(module) is None:
-            console.print(f"{name}: skipped. It needs {module}: `pip install '.[peers]'`")
+            console.print(f"{name}: skipped. It needs {module}: `pip install '.\\[peers]'`")
             continue
         runs[name] = prepare(problem)
     return runs

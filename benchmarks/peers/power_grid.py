@@ -187,7 +187,7 @@ def main(
         rows += beside_andes(task)
         critical["andes"] = {step: critical_by_andes(2.0, step) for step in STEPS[1:3]}
     except ImportError:
-        console.print('ANDES is left out: `pip install "manifold_jax[peers]"`.')
+        console.print('ANDES is left out: `pip install "manifold_jax\\[peers]"`.')
     show(console, rows, critical)
     if json is not None:
         content = {"rows": [dataclasses.asdict(row) for row in rows], "critical": critical}

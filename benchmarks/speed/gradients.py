@@ -276,7 +276,7 @@ def main(
     several = measure(f"batch of {batch}", jnp.linspace(9.0, 10.0, batch), jax.vmap, repeats // 3)
     peers = casadi_rows(float(gravity), repeats)
     if not peers:
-        console.print("casadi is not installed (`pip install 'manifold_jax[peers]'`): left out.")
+        console.print("casadi is not installed (`pip install 'manifold_jax\\[peers]'`): left out.")
     growth = memory_growth(gravity)
     saved = measure_outputs(repeats)
     quotients = ratios(single, several, saved)
