@@ -96,6 +96,63 @@ def reference_of_bounds():
     return found.fun
 
 
+def rate(y):
+    """Angular velocity on the circle."""
+    (q, v) = y
+    return q[0] * v[1] - q[1] * v[0]
+
+
+def test_a_limit_of_the_speed():
+    """From rest to rest with at most 0.95 rad/s at the times, while the cost of a torque grows with time."""
+    no_weight = lambda t, q, v, u: jnp.stack([-q[1], q[0]]) * u[0]
+    disc = mj.MechanicalSystem(1.0, lambda t, q, u: q @ q - 1, no_weight)
+    ts, at_rest = np.array([0.0, 0.2, 0.5, 0.9, 1.4, 1.6]), jnp.zeros(2)
+    found = mj.optimize_trajectory(
+        disc.terms,
+        disc.constraint,
+        ts,
+        (on_circle(0.3), at_rest),
+        np.zeros((6, 1)),
+        cost=lambda t, y, u: (1 + t) * u @ u,
+        goal=(on_circle(1.5), at_rest),
+        path_constraint=lambda t, y, u: jnp.abs(rate(y)) - 0.95,
+    )
+    rates = jax.vmap(rate)(found.ys)
+    assert found.success
+    assert rates.max() == pytest.approx(0.95, abs=1e-5)
+    assert found.cost == pytest.approx(reference_of_limit(ts, 0.95), rel=1e-6)
+
+
+def reference_of_limit(ts, most):
+    """The same in the angle: a quadratic program in the torques alone."""
+    fine = np.linspace(0.0, ts[-1], 16001)
+    hats = np.stack([np.interp(fine, ts, row) for row in np.eye(ts.size)])
+    H = scipy.integrate.simpson(hats[:, None] * hats[None] * (1 + fine), x=fine)
+    speeds = scipy.integrate.cumulative_trapezoid(hats, fine, initial=0)
+    way = scipy.integrate.simpson(speeds, x=fine)
+    at_knots = speeds[:, np.searchsorted(fine, ts - 1e-9)].T
+    ends = np.stack([at_knots[-1], way])
+    found = scipy.optimize.minimize(
+        lambda u: u @ H @ u,
+        np.zeros(ts.size),
+        jac=lambda u: 2 * H @ u,
+        method="SLSQP",
+        constraints=[
+            dict(type="eq", fun=lambda u: ends @ u - [0.0, 1.2], jac=lambda u: ends),
+            dict(type="ineq", fun=lambda u: most - at_knots @ u, jac=lambda u: -at_knots),
+        ],
+        options=dict(ftol=1e-14),
+    )
+    return found.fun
+
+
+def test_a_path_that_is_impossible():
+    """The point must not be higher than where it starts."""
+    found = turn(path_constraint=lambda t, y, u: y[1] - 0.2, max_iterations=60, throw=False)
+    assert not found.success
+    assert "apart, most at t = 0.2, the `path_constraint` 0" in found.message
+
+
 def weight_and_torque(t, q, v, u):
     """A ball of 1 kg on a circle of 1 m, with a torque about the centre."""
     return jnp.stack([-q[1], q[0]]) * u[0] - jnp.array([0.0, GRAVITY])
@@ -189,13 +246,14 @@ def test_iterations_that_are_too_few():
 
 @functools.cache
 def transcription():
-    """Wind that changes with time, a final cost, and a goal that is a function."""
+    """Wind that changes with time, a final cost, a goal that is a function, and a path constraint."""
     push = lambda t, q, v, u: jnp.concatenate([u, jnp.sin(2 * t)[None] - GRAVITY]) - 0.3 * v
     ball = mj.MechanicalSystem(1.0, lambda t, q, u: q @ q - 1, push)
     unravel = jax.flatten_util.ravel_pytree((jnp.zeros(3), jnp.zeros(3)))[1]
     last = lambda y: jnp.stack([jnp.sum(y[0] ** 3), y[0][0] * y[1][1]])
     cost = lambda t, y, u: u @ u + t * y[0][1] ** 2
-    shooting = Shooting(ball.terms, ball.constraint, dfx.Tsit5(), cost, last, unravel, 2)
+    path = lambda t, y, u: jnp.stack([t * y[0][0] * y[1][2] - u[1], u[0] * u[1] - y[0][2] ** 2])
+    shooting = Shooting(ball.terms, ball.constraint, dfx.Tsit5(), cost, last, path, unravel, 2)
     random = np.random.default_rng(0)
     q = random.standard_normal((4, 3))
     q /= np.linalg.norm(q, axis=1, keepdims=True)
@@ -281,6 +339,12 @@ def test_gaps_of_states_on_the_far_side():
         (dict(cost=lambda t, y, u: u), ValueError, "`cost` must return one number"),
         (dict(cost=3.0), TypeError, "`cost` must be a function"),
         (dict(final_cost=lambda y: y), ValueError, "`final_cost` must return one number"),
+        (dict(path_constraint=1.0), TypeError, "`path_constraint` must be a function"),
+        (
+            dict(path_constraint=lambda t, y, u: jnp.ones((2, 2))),
+            ValueError,
+            "`path_constraint` must return a number or",
+        ),
         (dict(states=jnp.zeros((4, 2))), ValueError, "`states` must have the shapes"),
         (dict(states=jnp.zeros((5, 2))), ValueError, "No guess of the state at t = 0.2"),
     ],
@@ -303,6 +367,10 @@ def test_bad_input(changed, error, message):
             "`goal` returns 2 numbers that depend on each other",
         ),
         (dict(inputs=np.zeros((5, 0))), "`inputs` must be finite"),
+        (
+            dict(path_constraint=lambda t, y, u: jnp.sqrt(jnp.sum((y - on_circle(0.3)) ** 2)) - 2),
+            "`path_constraint` or its derivative is not finite at t = 0 ",
+        ),
     ],
 )
 def test_a_guess_without_derivatives(changed, message):

@@ -62,7 +62,7 @@ class BlockHessian:
 
 
 class Minimum(NamedTuple):
-    """The unknowns, with the transcription whose charts they belong to, and the largest residual; how many
+    """The unknowns, with the transcription whose charts they belong to, and the largest violation; how many
     iterations were made, and whether the cost falls no more."""
 
     transcription: Transcription
@@ -80,7 +80,7 @@ def minimize(
     max_iterations: int,
     tolerance: float,
 ) -> Minimum:
-    """Minimize the cost where the residual is zero and the inputs are within their bounds."""
+    """Minimize the cost where the residual and the inputs are within their bounds."""
     hessian, T, v = BlockHessian(transcription), transcription, start
     options: dict[str, Any] = dict(initial_barrier_parameter=1e-2)
     best, iterations = None, 0
@@ -116,7 +116,9 @@ def _in_these_charts(
         hess=lambda v: none,  # the cost is in that of the Lagrangian
         method="trust-constr",
         bounds=bounds,
-        constraints=opt.NonlinearConstraint(T.residual, 0, 0, jac=jacobian, hess=hessian.at),
+        constraints=opt.NonlinearConstraint(
+            T.residual, T.lowest(v), 0, jac=jacobian, hess=hessian.at
+        ),
         options=dict(gtol=_SMALL, xtol=1e-12, **options),
     )
 

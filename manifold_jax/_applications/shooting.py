@@ -42,13 +42,14 @@ class LinearInputs(eqx.Module):
 
 class Shooting(eqx.Module):
     """How an interval is solved: in `steps` equal steps, an even number. `cost` is a rate; `last` returns the
-    final cost and the residual of the goal, one vector."""
+    final cost and the residual of the goal, one vector; `path` what must not be positive at the knots."""
 
     term: dfx.ODETerm
     constraint: AbstractConstraint
     solver: dfx.AbstractSolver
     cost: Callable
     last: Callable[[Y], Float[Array, " r"]]
+    path: Callable[[RealScalarLike, Y, Array], Float[Array, " s"]]
     unravel: Callable[[Array], Y] = eqx.field(static=True)
     steps: int = eqx.field(static=True)
 
@@ -129,6 +130,14 @@ class AtTheEnd(NamedTuple):
     by_z: Float[Array, "r d"]
 
 
+class AtTheKnots(NamedTuple):
+    """What must not be positive at all knots, and its derivatives by their coordinates and inputs."""
+
+    values: Float[Array, "K s"]
+    by_z: Float[Array, "K s d"]
+    by_u: Float[Array, "K s m"]
+
+
 @eqx.filter_jit
 def states_at(
     shooting: Shooting, charts: Charts, z: Float[Array, "K d"], u: Float[Array, "K m"]
@@ -170,3 +179,17 @@ def solve_last(shooting: Shooting, x: Float[Array, " n"], by_z: Float[Array, "n 
     last = lambda z: shooting.last(shooting.unravel(x + by_z @ z))
     at = jnp.zeros(by_z.shape[1], x.dtype)
     return AtTheEnd(last(at), jax.jacfwd(last)(at))
+
+
+@eqx.filter_jit
+def path_at(
+    shooting: Shooting, ts: Float[Array, " K"], knots: Knots, u: Float[Array, "K m"]
+) -> AtTheKnots:
+    """Return the path constraint at all knots."""
+
+    def path(z: Array, u: Array, t: Array, knot: Knots) -> Float[Array, " s"]:
+        return shooting.path(t, shooting.unravel(knot.x + knot.by_z @ z), u)
+
+    zero = jnp.zeros((u.shape[0], knots.by_z.shape[2]), u.dtype)
+    by_z, by_u = jax.vmap(jax.jacfwd(path, argnums=(0, 1)))(zero, u, ts, knots)
+    return AtTheKnots(jax.vmap(path)(zero, u, ts, knots), by_z, by_u)

@@ -22,6 +22,7 @@ from .shooting import Charts, Shooting
 from .trajectory_arguments import (
     check_guess,
     check_number,
+    check_path_constraint,
     check_setting,
     checked_bounds,
     checked_goal,
@@ -43,8 +44,8 @@ class OptimalTrajectory(eqx.Module):
     - `gap`: the largest difference of a state from the end of the interval before it, relative to `|y| + 1`.
     - `integration_error`: by how much the end of an interval changes with twice as many steps, in the same way, or
         the integral of the cost, relative to `1 + |cost|`; whichever is larger.
-    - `success`: gaps and goal are closed to 1e-6, `integration_error` is below 1e-3, and the optimizer has ended.
-        Otherwise `message` says what is wrong.
+    - `success`: gaps and goal are closed and the path constraint is kept to 1e-6, `integration_error` is below 1e-3, and
+        the optimizer has ended. Otherwise `message` says what is wrong.
     - `num_iterations`, `num_evaluations`: of the optimizer, and how often all intervals were solved.
     """
 
@@ -74,6 +75,7 @@ def optimize_trajectory(
     cost: Any,
     final_cost: Any = None,
     goal: Any = None,
+    path_constraint: Any = None,
     bounds: Any = (-np.inf, np.inf),
     states: Y | None = None,
     solver: dfx.AbstractSolver | None = None,
@@ -85,7 +87,7 @@ def optimize_trajectory(
     r"""Find the inputs `u(t)`, linear between given times, that minimize
 
     $$\int_{t_0}^{t_1} c(t, y, u)\,dt + c_1(y(t_1)), \qquad y' = f(t, y, u), \quad g(t, y) = 0, \quad
-    \underline u \le u \le \overline u,$$
+    h(t_k, y, u) \le 0, \quad \underline u \le u \le \overline u,$$
 
     from `y0`, to a goal. Multiple shooting: the states at the times are unknowns, too, as tangent coordinates
     in charts of the manifold, so that they and all states between them satisfy the constraint at every iterate;
@@ -109,6 +111,8 @@ def optimize_trajectory(
     - `final_cost`: `c_1(y)`, one number.
     - `goal`: the last state, on the manifold; or a function of it that returns an array of what must be
         zero: numbers that are independent on the manifold.
+    - `path_constraint`: `h(t, y, u)`, a number or an array of shape `(s,)` that must not be positive at any of `ts`:
+        bounds on states, distances to obstacles, powers of motors. Between the times it is not looked at.
     - `bounds`: lower and upper bounds of the inputs, numbers or of shape `(m,)`; infinite without.
     - `states`: a guess of the states, with a leading axis of `K`; by default on the way from `y0` straight
         to the goal, or without a state as goal those of the guessed inputs. For a motion that has to
@@ -127,7 +131,7 @@ def optimize_trajectory(
     are too coarse.
 
     The solution is a local minimum. The optimizer is SciPy's `trust-constr`, with first derivatives in forward
-    mode and second ones from updates; for hundreds of states or times, or bounds on states, write the equations in CasADi for IPOPT. Not
+    mode and second ones from updates; for hundreds of states or times write the equations in CasADi for IPOPT. Not
     inside `jit`. Feedback along the motion: [`regulate`][].
 
     Source: Bock & Plitt, IFAC Proc. 17 (1984) 1603-1608 (multiple shooting); Bordalba, Schoels, Ros, Porta & Diehl,
@@ -145,6 +149,8 @@ def optimize_trajectory(
     check_number("cost", cost, ts[0], y0, u[0])
     if final_cost is not None:
         check_number("final_cost", final_cost, y0)
+    if path_constraint is not None:
+        check_path_constraint(path_constraint, ts[0], y0, u[0])
     is_state = goal is not None and not callable(goal)
     if is_state:
         goal = checked_goal(goal, y0, constraint, ts[-1], u[-1])
@@ -158,6 +164,7 @@ def optimize_trajectory(
         dfx.Tsit5() if solver is None else solver,
         cost,
         _Last(final_cost, None if is_state else goal),
+        _Path(path_constraint),
         jfu.ravel_pytree(y0)[1],
         steps,
     )
@@ -184,6 +191,17 @@ class _Last(eqx.Module):
         value = jnp.zeros(()) if self.final_cost is None else self.final_cost(y)
         rest = jnp.zeros(0) if self.goal is None else jnp.atleast_1d(self.goal(y))
         return jnp.append(jnp.asarray(value, float), rest)
+
+
+class _Path(eqx.Module):
+    """The path constraint as a vector."""
+
+    function: Any
+
+    def __call__(self, t: RealScalarLike, y: Y, u: Float[Array, " m"]) -> Float[Array, " s"]:
+        if self.function is None:
+            return jnp.zeros(0, u.dtype)
+        return jnp.atleast_1d(jnp.asarray(self.function(t, y, u), u.dtype))
 
 
 def _solved(

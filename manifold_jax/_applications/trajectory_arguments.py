@@ -74,6 +74,16 @@ def check_number(name: str, function: Any, *args: Any) -> None:
         raise ValueError(f"`{name}` must return one number, got {shapes(out)}.")
 
 
+def check_path_constraint(function: Any, *args: Any) -> None:
+    if not callable(function):
+        raise TypeError(f"`path_constraint` must be a function, got {type(function).__name__}.")
+    out = eqx.filter_eval_shape(function, *args)
+    if getattr(out, "ndim", 2) > 1:
+        raise ValueError(
+            f"`path_constraint` must return a number or an array of shape (s,), got {shapes(out)}."
+        )
+
+
 def checked_goal(goal: Y, y0: Y, constraint: AbstractConstraint, t: Any, u: Any) -> Y:
     if not are_alike(goal, y0):
         raise ValueError(
@@ -90,7 +100,7 @@ def checked_goal(goal: Y, y0: Y, constraint: AbstractConstraint, t: Any, u: Any)
 
 def check_guess(ts: np.ndarray, now: Evaluation) -> None:
     """Refuse a guess from which no optimizer can start, and say why."""
-    ends, last = now.ends, now.last
+    ends, last, path = now.ends, now.last, now.path
     is_finite = lambda *parts: np.all(
         [np.isfinite(x).all(axis=tuple(range(1, x.ndim))) for x in parts], axis=0
     )
@@ -108,6 +118,12 @@ def check_guess(ts: np.ndarray, now: Evaluation) -> None:
     if not is_finite(last.values, last.by_z).all():
         raise ValueError(
             "`final_cost` or `goal`, or the derivative of one of them, is not finite at the last of the guessed `states`."
+        )
+    allowed = is_finite(*path)
+    if not allowed.all():
+        raise ValueError(
+            f"`path_constraint` or its derivative is not finite at t = {ts[np.argmin(allowed)]:.6g} with the guessed states and "
+            "inputs. A norm has no derivative at zero: square it, or give other `states`."
         )
     slopes = last.by_z[1:]
     if (

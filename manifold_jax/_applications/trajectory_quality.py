@@ -14,12 +14,14 @@ _CLOSED, _EXACT = 1e-6, 1e-3  # largest gaps and integration errors of a motion 
 
 
 class Measured(NamedTuple):
-    """How well the intervals fit together, where they do least, how far the goal is missed, and how well the
-    intervals are solved."""
+    """How well the intervals fit together, where they do least, how far the goal is missed, the largest value of
+    the path constraint and where it is, and how well the intervals are solved."""
 
     gap: float
     at: float
     miss: float
+    excess: float
+    excess_at: float
     error: float
 
 
@@ -40,16 +42,21 @@ def measure(T: Transcription, v: np.ndarray) -> Measured:
     error = np.max(errors)  # NaN if one is
     worst = int(np.argmax(np.nan_to_num(gaps, nan=np.inf)))
     miss = float(np.abs(now.last.values[1:]).max(initial=0))
-    return Measured(float(gaps[worst]), float(ts[worst + 1]), miss, float(error))
+    path = now.path.values.max(axis=1, initial=-np.inf)  # NaN if one is
+    last = int(np.argmax(np.nan_to_num(path, nan=np.inf)))
+    excess = float(path[last]), float(ts[last])
+    return Measured(float(gaps[worst]), float(ts[worst + 1]), miss, *excess, float(error))
 
 
 def message_of(found: Minimum, measured: Measured) -> str:
     """Return what is wrong with a result, nothing if it can be used."""
-    if not max(measured.gap, measured.miss) <= _CLOSED:
+    if not max(measured.gap, measured.miss, measured.excess) <= _CLOSED:
+        excess = f", the `path_constraint` {measured.excess:.2g} at t = {measured.excess_at:.6g}"
         return (
             f"No motion was found: after {found.iterations} iterations the parts of the motion are {measured.gap:.2g} apart, most at "
-            f"t = {measured.at:.6g}, and the function `goal` is {measured.miss:.2g}. The goal may be out of reach within `bounds` "
-            "and the time; otherwise give `states` or `inputs` that are nearer to a motion, or more `max_iterations`."
+            f"t = {measured.at:.6g}{excess if np.isfinite(measured.excess) else ''}, and the function `goal` is {measured.miss:.2g}. "
+            "The goal may be out of reach within `bounds`, the path and the time; otherwise give `states` or `inputs` that are "
+            "nearer to a motion, or more `max_iterations`."
         )
     if not measured.error <= _EXACT:
         return (

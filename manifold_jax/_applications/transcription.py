@@ -10,9 +10,11 @@ import scipy.sparse as sp
 
 from .shooting import (
     AtTheEnd,
+    AtTheKnots,
     Charts,
     IntervalEnds,
     Knots,
+    path_at,
     Shooting,
     solve_intervals,
     solve_last,
@@ -31,6 +33,7 @@ class Evaluation(NamedTuple):
     u: np.ndarray
     ends: IntervalEnds
     last: AtTheEnd
+    path: AtTheKnots
     gaps: np.ndarray
     by_start: np.ndarray
     by_end: np.ndarray
@@ -82,11 +85,12 @@ class Transcription:
         times = jnp.stack([self.charts.ts[:-1], self.charts.ts[1:]], axis=1)
         ends = solve_intervals(self.shooting, times, starts, pairs)
         last = solve_last(self.shooting, knots.x[-1], knots.by_z[-1])
-        knots, u, ends, last = jax.tree.map(np.asarray, (knots, u, ends, last))
+        path = path_at(self.shooting, self.charts.ts, knots, u)
+        knots, u, ends, last, path = jax.tree.map(np.asarray, (knots, u, ends, last, path))
         differences = ends.reached[:, :-1] - knots.x[1:]
         gaps, slopes = gaps_of(differences, np.asarray(self.charts.bases[1:]))
         by_start, by_end = slopes @ ends.by_p[:, :-1], -slopes @ knots.by_z[1:]
-        return Evaluation(knots, u, ends, last, gaps, by_start, by_end)
+        return Evaluation(knots, u, ends, last, path, gaps, by_start, by_end)
 
     def cost(self, v: np.ndarray) -> float:
         now = self.at(v)
@@ -99,9 +103,17 @@ class Transcription:
         return gradient[:-1]
 
     def residual(self, v: np.ndarray) -> np.ndarray:
-        """Return the gaps between intervals and the residual of the goal."""
+        """Return the gaps between intervals, the residual of the goal and the path constraint."""
         now = self.at(v)
-        return np.nan_to_num(np.append(now.gaps, now.last.values[1:]), nan=_FAR)
+        parts = now.gaps.ravel(), now.last.values[1:], now.path.values.ravel()
+        return np.nan_to_num(np.concatenate(parts), nan=_FAR)
+
+    def lowest(self, v: np.ndarray) -> np.ndarray:
+        """Return lower bounds of the residual, whose upper ones are zero."""
+        count = self.at(v).path.values.size
+        lowest = np.zeros(self.residual(v).size)
+        lowest[lowest.size - count :] = -np.inf
+        return lowest
 
     def jacobian(self, v: np.ndarray) -> sp.csr_array:
         now = self.at(v)
@@ -109,18 +121,32 @@ class Transcription:
         rows = np.arange(count * d).reshape(count, d, 1)
         of_goal = count * d + np.arange(now.last.values.size - 1)[:, None]
         gaps = np.concatenate([now.by_start, now.by_end], axis=2)
+        equations = count * d + of_goal.size
+        of_path = equations + np.arange(now.path.values.size).reshape(*now.path.values.shape, 1)
         parts = [
             (rows, self.places[:, None, :], gaps),
             (of_goal, self.knots[None, -1], now.last.by_z[1:]),
+            (of_path, self.knots[:, None], now.path.by_z),
+            (of_path, self.inputs[:, None], now.path.by_u),
         ]
-        return sum_entries(parts, (count * d + of_goal.size, self.size))
+        return sum_entries(parts, (equations + of_path.size, self.size))
 
     def gradients(self, now: Evaluation, multipliers: np.ndarray) -> np.ndarray:
         """Return what each interval contributes to the gradient of `cost + multipliers @ residual`."""
-        of_gaps = multipliers[: now.gaps.size].reshape(now.gaps.shape)
+        of_gaps, of_goal, of_path = np.split(
+            multipliers, [now.gaps.size, multipliers.size - now.path.values.size]
+        )
+        of_gaps, of_path = of_gaps.reshape(now.gaps.shape), of_path.reshape(now.path.values.shape)
         by_start = np.einsum("kd,kdp->kp", of_gaps, now.by_start) + now.ends.by_p[:, -1]
         by_end = np.einsum("kd,kde->ke", of_gaps, now.by_end)
-        by_end[-1] += np.append(1, multipliers[now.gaps.size :]) @ now.last.by_z
+        by_end[-1] += np.append(1, of_goal) @ now.last.by_z
+        d, m = self.knots.shape[1], self.inputs.shape[1]
+        by_z = np.einsum("ks,ksd->kd", of_path, now.path.by_z)
+        by_u = np.einsum("ks,ksm->km", of_path, now.path.by_u)
+        by_start[:, :d] += by_z[:-1]
+        by_start[:, d : d + m] += by_u[:-1]
+        by_start[-1, d + m :] += by_u[-1]
+        by_end[-1] += by_z[-1]
         return np.append(by_start, by_end, axis=1)
 
     def recentered(self, v: np.ndarray) -> tuple["Transcription", np.ndarray, np.ndarray]:
