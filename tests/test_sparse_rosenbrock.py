@@ -69,7 +69,7 @@ def test_systems_and_their_derivatives(method):
 
 
 @pytest.mark.parametrize("method", METHODS)
-@pytest.mark.parametrize("fault", ["equal rows", "zero row", "zero column", "nan"])
+@pytest.mark.parametrize("fault", ["equal rows", "a column", "zero row", "zero column", "nan"])
 def test_singular_matrices_are_not_usable(method, fault):
     A = banded(50)
     pair = sp.csr_matrix(([True, True], ([3, 7], [7, 3])), A.shape)
@@ -78,6 +78,9 @@ def test_singular_matrices_are_not_usable(method, fault):
     if fault == "equal rows":
         A[3] = A[7] = 0
         A[[3, 3, 7, 7], [3, 7, 3, 7]] = 1.0
+    elif fault == "a column":  # has all entries of two rows
+        A[3] = A[7] = 0
+        A[[3, 7], 3] = 1.0, 2.0
     elif fault == "zero row":
         A[3] = 0
     elif fault == "zero column":

@@ -76,11 +76,14 @@ class KLU(eqx.Module):
 
     @staticmethod
     def of(A: SparseMatrix) -> "KLU":
-        """KLU raises where a pivot is exactly zero. Relative changes of a few units of rounding make it a
-        small number, which the known solution finds."""
-        eps = float(jnp.finfo(A.entries.dtype).eps)
-        changes = np.random.default_rng(0).integers(-8, 9, A.pattern.num_entries) * eps
-        return KLU(SparseMatrix(A.entries * (1 + constant(changes)), A.pattern))
+        """KLU raises where a pivot is exactly zero. Relative changes of a few units of rounding, and tiny numbers
+        in the places of zeros, make it a small number, which the known solution finds."""
+        random, eps = np.random.default_rng(0), float(jnp.finfo(A.entries.dtype).eps)
+        changes = 1 + eps * random.integers(-8, 9, A.pattern.num_entries)
+        tiny = eps**2 * random.uniform(1, 2, A.pattern.num_entries)
+        largest = jnp.max(jnp.abs(A.entries))
+        entries = jnp.where(A.entries == 0, largest * constant(tiny), A.entries * constant(changes))
+        return KLU(SparseMatrix(entries, A.pattern))
 
     def solve(self, b: Float[Array, " n"]) -> Float[Array, " n"]:
         pattern = self.A.pattern
