@@ -474,6 +474,22 @@ def test_a_solve_that_goes_on_from_the_state_of_a_solver(second, in_a_loop, monk
     np.testing.assert_allclose(reverse, forward, rtol=1e-11)
 
 
+def test_reverse_mode_of_a_derivative():
+    """There is no loop that could be repeated backwards: the message says what to write."""
+
+    def end(rate):
+        term, at = dfx.ODETerm(lambda t, y, rate: -rate * y), jnp.array(1.0)
+        return mj.diffeqsolve(term, dfx.Tsit5(), 0.0, 1.0, 0.25, at, rate).ys[0]
+
+    gradient = jax.grad(end)
+    assert jax.jit(jax.jacfwd(gradient))(0.7) == pytest.approx(np.exp(-0.7), abs=1e-4)
+    tangent = lambda rate: jax.jvp(end, (rate,), (1.0,))[1]
+    batch = lambda rate: jnp.sum(jax.vmap(gradient)(jnp.stack([rate, rate])))
+    for derivative in (gradient, jax.jit(gradient), tangent, batch):
+        with pytest.raises(RuntimeError, match=r"Write `jax.jacfwd\(jax.grad\(f\)\)`"):
+            jax.grad(derivative)(0.7)
+
+
 def test_steps_across_jumps_of_the_field():
     """The state after a jump starts a new step just behind it."""
 

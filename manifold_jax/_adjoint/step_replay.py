@@ -13,6 +13,7 @@ from .._base.compat import (
     diffrax_loop,
     is_unsafe_sde,
     nondifferentiable,
+    nondifferentiable_backward,
     Progress,
     save_states,
     SaveState,
@@ -158,8 +159,8 @@ _NO_STEP_SIZES = (
     "`dt0` has no derivative with `adjoint=StepReplayAdjoint()`, the default: what a solution depends on step sizes is "
     "its error. Pass `jax.lax.stop_gradient(dt0)`."
 )
-_TWICE_BACKWARDS = (
-    "The gradient of `adjoint=StepReplayAdjoint()`, the default, cannot be differentiated in reverse mode again. Write "
+_FORWARDS_ALONE = (
+    "A derivative with `adjoint=StepReplayAdjoint()`, the default, cannot be differentiated in reverse mode again. Write "
     "`jax.jacfwd(jax.grad(f))`, or pass `adjoint=diffrax.DirectAdjoint()`."
 )
 _UNBOUNDED = (
@@ -200,14 +201,16 @@ def _solve_jvp(values, primals, tangents):
             values = outputs_of(state, remembers), (record, state)
             return eqx.filter(values, eqx.is_inexact_array)
 
-        return eqx.filter_jvp(final, (differentiable[-1],), (run_tangent,))[1]
+        tangents_out = eqx.filter_jvp(final, (differentiable[-1],), (run_tangent,))[1]
+        return nondifferentiable_backward(tangents_out, msg=_FORWARDS_ALONE)
 
     def transpose(arrays, cotangents_out):
         differentiable, _, values = eqx.combine(arrays, static)
         gradient = structure.flatten_up_to(
             _gradient(differentiable, is_perturbed, values, cotangents_out)
         )
-        return [bar for bar, dx in zip(gradient, leaves_in, strict=True) if dx is not None]
+        wanted = [bar for bar, dx in zip(gradient, leaves_in, strict=True) if dx is not None]
+        return nondifferentiable_backward(wanted, msg=_FORWARDS_ALONE)
 
     outputs_like = eqx.filter(values[1:], eqx.is_inexact_array)
     given = [dx for dx in leaves_in if dx is not None]
@@ -217,13 +220,11 @@ def _solve_jvp(values, primals, tangents):
 
 def _gradient(differentiable, is_perturbed, values, cotangents_out):
     _, outputs, (record, final_state) = values
-    outputs_bar, record_bar = cotangents_out
+    outputs_bar, _ = (
+        cotangents_out  # nothing but this function reads the record and the final state
+    )
     if record is None:
         raise RuntimeError(_UNBOUNDED)
-    # Nothing but this function reads the record and the final state: that they have a cotangent means
-    # that the gradient computed here is being differentiated in reverse mode.
-    if jtu.tree_leaves(record_bar):
-        raise RuntimeError(_TWICE_BACKWARDS)
     replay, start, (t0, t1, ts), run = differentiable
     end = Progress.of(final_state)
     bar = with_zeros(eqx.filter(outputs, eqx.is_inexact_array), outputs_bar)

@@ -34,6 +34,7 @@ from equinox.internal import (
     buffer_at_set as buffer_at_set,  # writes in place, also under vmap
     MaybeBuffer as MaybeBuffer,  # an array, or one that a loop writes to in place
     nondifferentiable as nondifferentiable,
+    nondifferentiable_backward as nondifferentiable_backward,
     unvmap_any as unvmap_any,  # over all lanes of a batch
     unvmap_max as unvmap_max,
     while_loop as while_loop,  # Diffrax's loops take its arguments
