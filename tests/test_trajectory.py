@@ -12,8 +12,9 @@ import scipy.integrate
 import scipy.optimize
 
 import manifold_jax as mj
-from manifold_jax._applications.quasi_newton import BlockHessian
+from manifold_jax._applications.quasi_newton import BlockHessian, Minimum
 from manifold_jax._applications.shooting import Charts, Shooting
+from manifold_jax._applications.trajectory_quality import Measured, message_of
 from manifold_jax._applications.transcription import gaps_of, Transcription
 
 
@@ -151,6 +152,15 @@ def test_a_path_that_is_impossible():
     found = turn(path_constraint=lambda t, y, u: y[1] - 0.2, max_iterations=60, throw=False)
     assert not found.success
     assert "apart, most at t = 0.2, the `path_constraint` 0" in found.message
+
+
+@pytest.mark.parametrize("name", ["gap", "miss", "excess", "error"])
+def test_what_is_not_a_number(name):
+    """No comparison with NaN holds: such a motion is not found."""
+    good = Measured(gap=0.0, at=0.2, miss=0.0, excess=-1.0, excess_at=0.2, error=0.0)
+    found = Minimum(None, np.zeros(1), 0.0, 0.0, 7, is_final=True)
+    assert not message_of(found, good)
+    assert "nan" in message_of(found, good._replace(**{name: np.nan}))
 
 
 def weight_and_torque(t, q, v, u):

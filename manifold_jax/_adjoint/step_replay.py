@@ -65,8 +65,8 @@ class StepReplayAdjoint(dfx.AbstractAdjoint):
 
     `ValueError` for an `UnsafeBrownianPath`. `RuntimeError` when differentiating with `max_steps=None`,
     as there is no room for the record, or with respect to `dt0`, on which a solution depends only by
-    its error. Both modes can be differentiated in forward mode once more (Hessian-vector products), but
-    not in reverse mode: for that use `diffrax.DirectAdjoint()`. Under `vmap` each trajectory sums up a
+    its error; and when a derivative of either mode is differentiated in reverse mode: in forward mode it can be
+    (Hessian-vector products), otherwise use `diffrax.DirectAdjoint()`. Under `vmap` each trajectory sums up a
     gradient with respect to shared parameters, also if they are thousands (neural networks).
 
     Source: Griewank & Walther, Evaluating Derivatives (2008), ch. 12, without recursion.
@@ -220,9 +220,8 @@ def _solve_jvp(values, primals, tangents):
 
 def _gradient(differentiable, is_perturbed, values, cotangents_out):
     _, outputs, (record, final_state) = values
-    outputs_bar, _ = (
-        cotangents_out  # nothing but this function reads the record and the final state
-    )
+    # Nothing but this function reads the record and the final state.
+    outputs_bar, _ = cotangents_out
     if record is None:
         raise RuntimeError(_UNBOUNDED)
     replay, start, (t0, t1, ts), run = differentiable

@@ -15,7 +15,7 @@ _CLOSED, _EXACT = 1e-6, 1e-3  # largest gaps and integration errors of a motion 
 
 class Measured(NamedTuple):
     """How well the intervals fit together, where they do least, how far the goal is missed, the largest value of
-    the path constraint and where it is, and how well the intervals are solved."""
+    the path constraint (minus infinity without one) and where it is, and how well the intervals are solved."""
 
     gap: float
     at: float
@@ -50,11 +50,11 @@ def measure(T: Transcription, v: np.ndarray) -> Measured:
 
 def message_of(found: Minimum, measured: Measured) -> str:
     """Return what is wrong with a result, nothing if it can be used."""
-    if not max(measured.gap, measured.miss, measured.excess) <= _CLOSED:
+    if not np.max([measured.gap, measured.miss, measured.excess]) <= _CLOSED:  # NaN if one is
         excess = f", the `path_constraint` {measured.excess:.2g} at t = {measured.excess_at:.6g}"
         return (
             f"No motion was found: after {found.iterations} iterations the parts of the motion are {measured.gap:.2g} apart, most at "
-            f"t = {measured.at:.6g}{excess if np.isfinite(measured.excess) else ''}, and the function `goal` is {measured.miss:.2g}. "
+            f"t = {measured.at:.6g}{'' if measured.excess == -np.inf else excess}, and the function `goal` is {measured.miss:.2g}. "
             "The goal may be out of reach within `bounds`, the path and the time; otherwise give `states` or `inputs` that are "
             "nearer to a motion, or more `max_iterations`."
         )

@@ -93,7 +93,7 @@ def _constant(example: Example, rows: np.ndarray, weights: np.ndarray) -> np.nda
     inputs = [tracked(tree, anything) for tree in (example.t, example.jets, example.args)]
     try:
         return ~incidence(gradient, *inputs).depends[:, 0].reshape(shape)
-    except (ValueError, NotImplementedError):  # e.g. `while_loop` has no gradient
+    except (ValueError, RuntimeError):  # no gradient: `while_loop`, the derivative of a solve
         return np.zeros(shape, bool)
 
 

@@ -152,7 +152,7 @@ def _check(case: Case, name: str, adjoint: dfx.AbstractAdjoint, forward: _Forwar
     gradient = jax.jit(_gradient(case, name, adjoint))
     try:
         program, compile_s = compiled(gradient, theta)
-    except (ValueError, TypeError, NotImplementedError) as error:
+    except (ValueError, TypeError, RuntimeError) as error:
         return Check(name, refused=str(error).strip().splitlines()[0])
     analysis = program.memory_analysis()
     batch = np.asarray(jax.jit(jax.vmap(gradient))(forward.parameters))
