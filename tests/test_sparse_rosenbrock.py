@@ -21,13 +21,13 @@ from manifold_jax._rosenbrock.algebraic import consistent
 
 
 needs_klu = pytest.mark.skipif(not has_klu(jnp.float64), reason="klujax is not installed")
-METHODS = ["blocks", pytest.param("klu", marks=needs_klu)]
+METHODS = ["tridiagonal", "multi-elimination", pytest.param("klu", marks=needs_klu)]
 
 
-def banded(n: int, seed: int = 0) -> sp.csr_matrix:
+def banded(method: str, n: int, seed: int = 0) -> sp.csr_matrix:
     """A matrix with two diagonals beside the main one, in a random order."""
-    random = np.random.default_rng(seed)
-    A = sp.diags([random.normal(size=n - k) for k in (2, 1)], [-2, 1], shape=(n, n))
+    random, below = np.random.default_rng(seed), 1 if method == "tridiagonal" else 2
+    A = sp.diags([random.normal(size=n - k) for k in (below, 1)], [-below, 1], shape=(n, n))
     A = sp.csr_matrix(A + sp.diags(3 + random.uniform(size=n)))
     order = random.permutation(n)
     return sp.csr_matrix(A[order][:, order])
@@ -40,8 +40,8 @@ def from_scipy(A: sp.csr_matrix) -> SparseMatrix:
 
 @pytest.mark.parametrize("method", METHODS)
 def test_systems_and_their_derivatives(method):
-    A, b = banded(50), jnp.asarray(np.random.default_rng(1).normal(size=50))
-    sparse, direction = from_scipy(A), from_scipy(banded(50, 2) * (A != 0))
+    A, b = banded(method, 50), jnp.asarray(np.random.default_rng(1).normal(size=50))
+    sparse, direction = from_scipy(A), from_scipy(banded(method, 50, 2) * (A != 0))
     direction = SparseMatrix(jnp.cos(jnp.arange(sparse.entries.size)), sparse.pattern)
     dA = np.zeros((50, 50))
     dA[sparse.pattern.rows, sparse.pattern.columns] = direction.entries
@@ -71,16 +71,17 @@ def test_systems_and_their_derivatives(method):
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("fault", ["equal rows", "a column", "zero row", "zero column", "nan"])
 def test_singular_matrices_are_not_usable(method, fault):
-    A = banded(50)
-    pair = sp.csr_matrix(([True, True], ([3, 7], [7, 3])), A.shape)
+    A = banded(method, 50)
+    i = next(j for j in A[3].indices if j != 3)
+    pair = sp.csr_matrix(([True, True], ([3, i], [i, 3])), A.shape)
     pattern = SquarePattern(sp.csr_matrix((A != 0) + pair))
     A = A.toarray()
     if fault == "equal rows":
-        A[3] = A[7] = 0
-        A[[3, 3, 7, 7], [3, 7, 3, 7]] = 1.0
+        A[3] = A[i] = 0
+        A[[3, 3, i, i], [3, i, 3, i]] = 1.0
     elif fault == "a column":  # has all entries of two rows
-        A[3] = A[7] = 0
-        A[[3, 7], 3] = 1.0, 2.0
+        A[3] = A[i] = 0
+        A[[3, i], 3] = 1.0, 2.0
     elif fault == "zero row":
         A[3] = 0
     elif fault == "zero column":
@@ -94,16 +95,17 @@ def test_singular_matrices_are_not_usable(method, fault):
 
 
 def filters(n, shift=0):
-    """Low-pass filters in a row: voltages `v` of capacitors, and `e` of the nodes between two resistors
-    and a diode. With a `shift` no algebraic equation is in the place of its unknown."""
+    """Low-pass filters in a row: voltages `v` of capacitors, which leak to the second before them, and `e` of
+    the nodes between two resistors and a diode. With a `shift` no algebraic equation is in the place of its unknown."""
 
     def ladder(t, y, args):
         frequency, resistance, capacitance = args
         v, e = y["v"], jnp.roll(y["e"], shift)
         left = jnp.concatenate([jnp.sin(frequency * t)[None], v[:-1]])
         right = jnp.concatenate([e[1:], v[-1:]])
+        leak = 0.1 * (v - jnp.concatenate([jnp.zeros(2), v[:-2]]))
         node = (left - e) / resistance - (e - v) - 1e-3 * (jnp.exp(e) - 1)
-        return {"v": ((e - v) - (v - right) / resistance) / capacitance, "e": node}
+        return {"v": ((e - v) - (v - right) / resistance - leak) / capacitance, "e": node}
 
     mass = {"v": np.ones(n), "e": np.zeros(n)}
     return mj.MassMatrixTerm(ladder, mass), {"v": jnp.zeros(n), "e": jnp.zeros(n)}
@@ -150,7 +152,7 @@ def test_solutions_and_gradients_as_dense(monkeypatch):
     program = jax.value_and_grad(end, argnums=2, has_aux=True)
     run = lambda structure: jax.jit(lambda args: program(structure, filters(32), args))(ARGS)
     (_, sparse), by_sparse = run("auto")
-    assert methods() == {"blocks"}
+    assert methods() == {"multi-elimination"}
     (_, dense), by_dense = run("dense")
     assert sparse.stats["num_steps"] == dense.stats["num_steps"] >= 5
     for name in ("v", "e"):
@@ -213,23 +215,43 @@ def test_masses_that_are_not_known():
     shifted = sparsity.choose_sparsity("auto", lambda x: jnp.roll(x, 1), x, mass)
     assert shifted is None
     own = sparsity.choose_sparsity("auto", lambda x: x - jnp.append(x[1:], 0.0), x, mass)
-    assert own.method == "blocks"
+    assert own.method == "tridiagonal"
 
 
 def wide(x):
-    """Each equation with five random unknowns."""
-    return jnp.sum(x[np.random.default_rng(0).integers(x.size, size=(5, x.size))], axis=0)
+    """Each equation with eight random unknowns."""
+    return jnp.sum(x[np.random.default_rng(0).integers(x.size, size=(8, x.size))], axis=0)
 
 
 @pytest.mark.parametrize(
     ("name", "function", "mass", "klu", "expected"),
     [
         ("few unknowns", lambda x: jnp.roll(x[:10], 1), None, True, None),
-        ("neighbours", lambda x: jnp.diff(x, append=0.0), None, False, "blocks"),
+        ("neighbours", lambda x: jnp.diff(x, append=0.0), None, False, "tridiagonal"),
+        (
+            "two neighbours",
+            lambda x: x + jnp.append(x[2:], x[:2]),
+            None,
+            False,
+            "multi-elimination",
+        ),
+        (
+            "and no exchanges",
+            lambda x: x + jnp.append(x[2:], x[:2]),
+            np.zeros(130),
+            True,
+            "multi-elimination",
+        ),
         ("no own unknown", lambda x: jnp.roll(x, 1), np.zeros(130), False, None),
         ("no own unknown", lambda x: jnp.roll(x, 1), np.zeros(130), True, "klu"),
         ("few for KLU", lambda x: jnp.roll(x, 1), np.zeros(70), True, None),
-        ("own unknown", lambda x: x + jnp.append(x[1:], 0.0), np.zeros(130), True, "blocks"),
+        (
+            "own unknown",
+            lambda x: x + jnp.append(x[1:], 0.0),
+            np.zeros(130),
+            True,
+            "tridiagonal",
+        ),
         ("wide", wide, None, False, None),
         ("wide", wide, None, True, "klu"),
         ("a matrix", lambda x: x, np.eye(130), True, None),
@@ -238,7 +260,7 @@ def wide(x):
 )
 def test_choice(monkeypatch, name, function, mass, klu, expected):
     monkeypatch.setattr(sparsity, "has_klu", lambda dtype: klu)
-    x = jnp.ones({"few unknowns": 10, "few for KLU": 70}.get(name, 130))
+    x = jnp.ones({"few unknowns": 10, "few for KLU": 70, "wide": 260}.get(name, 130))
     massless = None if mass is None else np.asarray(mass) == 0
     mass = None if mass is None else jnp.asarray(mass)
     found = sparsity.choose_sparsity("auto", function, x, mass, massless)
@@ -262,7 +284,7 @@ def test_refusals(monkeypatch):
     ):
         sparsity.choose_sparsity("sparse", ring, x, x, np.ones(70, bool))
     with pytest.raises(ValueError, match=r"Install klujax .*manifold_jax\[sparse\]"):
-        sparsity.choose_sparsity("sparse", wide, x, None)
+        sparsity.choose_sparsity("sparse", wide, jnp.ones(260), None)
 
 
 @needs_klu

@@ -11,7 +11,6 @@ solids and in the electrolyte follow algebraic equations.
 import dataclasses
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from scipy import constants
@@ -135,7 +134,13 @@ class Cell:
         salt, solid, electrolyte = state["salt"], state["solid"], state["electrolyte"]
         sides = (
             (parameters.negative, state["negative"], slice(0, n), slice(0, n), graphite_potential),
-            (parameters.positive, state["positive"], slice(n + s, None), slice(n, None), nmc_potential),
+            (
+                parameters.positive,
+                state["positive"],
+                slice(n + s, None),
+                slice(n, None),
+                nmc_potential,
+            ),
         )
         particles, sources = [], []
         for electrode, full, there, here, potential in sides:
@@ -151,16 +156,22 @@ class Cell:
             "negative": particles[0],
             "positive": particles[1],
             "salt": salt_rate,
-            "solid": jnp.concatenate([inner + sources[0], outer + sources[1]]) / density * parameters.negative.thickness,
+            "solid": jnp.concatenate([inner + sources[0], outer + sources[1]])
+            / density
+            * parameters.negative.thickness,
             "electrolyte": (ionic - source) / density * parameters.negative.thickness,
         }
 
-    def particles(self, electrode: Electrode, full: Any, salt: Any, over: Any, potential: Any) -> tuple[Any, Any]:
+    def particles(
+        self, electrode: Electrode, full: Any, salt: Any, over: Any, potential: Any
+    ) -> tuple[Any, Any]:
         """Return the rates in the particles, and the current into the electrolyte per volume."""
         edges = np.linspace(0.0, 1.0, self.shells + 1)
         volumes = np.diff(edges**3) / 3
         surface = 1.5 * full[:, -1] - 0.5 * full[:, -2]
-        exchange = electrode.reaction * electrode.maximum * jnp.sqrt(SALT * salt * surface * (1 - surface))
+        exchange = (
+            electrode.reaction * electrode.maximum * jnp.sqrt(SALT * salt * surface * (1 - surface))
+        )
         current = 2 * exchange * jnp.sinh((over - potential(surface)) / (2 * THERMAL_VOLTAGE))
         inside = jnp.diff(full, axis=1) * self.shells * edges[1:-1] ** 2
         time_constant = electrode.radius**2 / electrode.diffusivity
@@ -169,11 +180,15 @@ class Cell:
         rate = jnp.diff(flux, axis=1) / volumes / time_constant
         return rate, 3 * electrode.solid / electrode.radius * current
 
-    def electrolyte(self, parameters: Parameters, salt: Any, potential: Any, source: Any) -> tuple[Any, Any]:
+    def electrolyte(
+        self, parameters: Parameters, salt: Any, potential: Any, source: Any
+    ) -> tuple[Any, Any]:
         """Return the rates of the salt and the divergence of the current."""
         n, s, p = self.points
         negative, positive = parameters.negative, parameters.positive
-        of_points = lambda values: jnp.concatenate([jnp.full(k, v) for k, v in zip(self.points, values)])
+        of_points = lambda values: jnp.concatenate(
+            [jnp.full(k, v) for k, v in zip(self.points, values)]
+        )
         width = of_points([negative.thickness / n, SEPARATOR_THICKNESS / s, positive.thickness / p])
         porosity = of_points([negative.porosity, SEPARATOR_POROSITY, positive.porosity])
         transport = porosity**BRUGGEMAN

@@ -21,8 +21,6 @@ SMALLEST = 64
 SMALLEST_KLU = 128
 # The largest number of colors as a part of the number of unknowns.
 _MOST_COLORS = 1 / 3
-# The largest width of blocks, as a part of the number of unknowns, for which they are eliminated.
-_WIDEST = 1 / 6
 
 
 class Sparsity(NamedTuple):
@@ -69,15 +67,17 @@ def choose_sparsity(
         # Entries of the mass may be zero or not: exchanges of rows of dense matrices find out.
         return None
     with_klu = has_klu(x.dtype)
-    narrow = pattern.block_order.width <= _WIDEST * n
     is_regular = mass is None or (massless is not None and not massless.any())
     needs_no_exchanges = is_regular or len(pattern.on_diagonal) == n
-    if narrow and (needs_no_exchanges or (choice == "sparse" and not with_klu)):
-        return Sparsity(pattern, "blocks")
+    if pattern.block_order.width == 1:
+        return Sparsity(pattern, "tridiagonal")
+    can_do_without = needs_no_exchanges or (choice == "sparse" and not with_klu)
+    if can_do_without and pattern.elimination_plan is not None:
+        return Sparsity(pattern, "multi-elimination")
     if with_klu and (choice == "sparse" or n >= SMALLEST_KLU):
         return Sparsity(pattern, "klu")
     if choice == "sparse":
-        raise ValueError(_NO_LIBRARY.format(width=pattern.block_order.width))
+        raise ValueError(_NO_LIBRARY)
     return None
 
 
@@ -87,8 +87,8 @@ _NOT_SPARSE = (
     "over, not in `args`, or use `structure='dense'`."
 )
 _NO_LIBRARY = (
-    "`structure='sparse'`, but reordered the equations of `terms` are coupled in blocks of {width}, too wide to be "
-    "eliminated without a library. Install klujax (`pip install klujax`, the extra `manifold_jax[sparse]`; for CPUs "
+    "`structure='sparse'`, but eliminating the unknowns of `terms` one by one couples too many of the others to "
+    "do without a library. Install klujax (`pip install klujax`, the extra `manifold_jax[sparse]`; for CPUs "
     "and 64-bit numbers), or use `structure='dense'`."
 )
 

@@ -1,5 +1,6 @@
 """Direct solution of sparse systems with any nonsingular matrix."""
 
+import dataclasses
 from typing import Any, Literal, TypeAlias
 
 import equinox as eqx
@@ -9,26 +10,30 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..._base.klu import klujax
-from ..._base.types import BoolScalar
+from ..._base.types import BoolScalar, FloatScalar
 from ..dense import Factorization
-from .elimination import Blocks, eliminate
-from .factorization import solve_in_blocks
+from .multi_elimination import MultiElimination
 from .square import constant, multiply_sparse, permutation, SparseMatrix, SquarePattern
 
 
-Method: TypeAlias = Literal["blocks", "klu"]
+Method: TypeAlias = Literal["tridiagonal", "multi-elimination", "klu"]
 
 
 def factorize_sparse(A: SparseMatrix, method: Method) -> Factorization:
     """Factor a matrix; one that is singular or not finite becomes another one.
 
-    It is usable if a system with a known solution is solved to some digits.
+    It is usable if a system with a known solution is solved to some digits. Where these are not many, solutions
+    of the elimination without exchanges of rows are refined.
     """
     fixed, regular = jax.lax.stop_gradient(A), permutation(A.pattern, A.entries.dtype)
     possible = jnp.all(jnp.isfinite(fixed.entries)) & ~fixed.has_empty_lines()
     fixed = _where(possible, fixed, regular)
-    factors = BlockElimination.of(fixed) if method == "blocks" else KLU.of(fixed)
-    usable = possible & _is_right(fixed, factors)
+    factors = _FACTORS[method](fixed)
+    eps, error = float(jnp.finfo(fixed.entries.dtype).eps), _error(fixed, factors)
+    usable = possible & (error <= eps ** (1 / 4))
+    if isinstance(factors, MultiElimination):
+        num_solves = jnp.where(error <= eps ** (2 / 3), 1, 2)
+        factors = dataclasses.replace(factors, num_solves=num_solves)
     A = _where(usable, A, regular)
     return Factorization(A, Checked(factors, usable), usable, multiply_sparse)
 
@@ -50,16 +55,15 @@ def _where(condition: BoolScalar, A: SparseMatrix, B: SparseMatrix) -> SparseMat
     return SparseMatrix(jnp.where(condition, A.entries, B.entries), A.pattern)
 
 
-def _is_right(A: SparseMatrix, factors: Any) -> BoolScalar:
-    """Solve a system with a known solution, scaled to be independent of the units of the unknowns."""
+def _error(A: SparseMatrix, factors: Any) -> FloatScalar:
+    """Solve a system with a known solution, scaled to be independent of the units of the unknowns. Without full
+    rank the error is as large as the solution."""
     columns = constant(A.pattern.columns)
     size = jax.ops.segment_max(jnp.abs(A.entries), columns, A.pattern.size)
     mixed = jnp.arange(size.size, dtype=jnp.uint32) * jnp.uint32(2654435769)
     known = jnp.where(mixed >> 31 == 0, 1, -1).astype(size.dtype)  # signs without a pattern
     solution = factors.solve(A.multiply(known / size))
-    error = jnp.max(jnp.abs(solution * size - known))
-    # Without full rank the error is as large as the solution.
-    return error <= float(jnp.finfo(size.dtype).eps) ** (1 / 4)
+    return jnp.max(jnp.abs(solution * size - known))
 
 
 class KLU(eqx.Module):
@@ -98,43 +102,32 @@ class KLU(eqx.Module):
         return jnp.where(error <= tolerance * size, x, jnp.nan)
 
 
-class BlockElimination(eqx.Module):
-    """Elimination of the blocks of a block tridiagonal matrix, without exchanges of rows between blocks,
-    and one step of iterative refinement."""
+class Tridiagonal(eqx.Module):
+    """Elimination by the library (LAPACK, cuSPARSE), with exchanges of rows, once for every right-hand side."""
 
-    A: SparseMatrix
-    blocks: Blocks
-    eliminated: Any
+    lower: Float[Array, " n"]
+    diagonal: Float[Array, " n"]
+    upper: Float[Array, " n"]
+    pattern: SquarePattern = eqx.field(static=True)
 
     @staticmethod
-    def of(A: SparseMatrix) -> "BlockElimination":
-        blocks = _blocks(A)
-        return BlockElimination(A, blocks, eliminate(blocks))
+    def of(A: SparseMatrix) -> "Tridiagonal":
+        order, n = A.pattern.block_order, A.pattern.size
+        i, j = order.own_places[A.pattern.rows], order.own_places[A.pattern.columns]
+        diagonals = jnp.zeros((3, n), A.entries.dtype)
+        diagonals = diagonals.at[constant(j - i + 1), constant(i)].set(A.entries)
+        return Tridiagonal(*diagonals, A.pattern)
 
     def solve(self, b: Float[Array, " n"]) -> Float[Array, " n"]:
-        return _refined(self.A.multiply, self.A.pattern, self.eliminated, b)
+        order = self.pattern.block_order
+        right = order.ordered(b)[:, None]
+        x = jax.lax.linalg.tridiagonal_solve(self.lower, self.diagonal, self.upper, right)
+        return order.out_of_blocks(x)
 
     def solve_transposed(self, b: Float[Array, " n"]) -> Float[Array, " n"]:
-        eliminated = eliminate(self.blocks.transposed())
-        return _refined(self.A.multiply_transposed, self.A.pattern, eliminated, b)
+        lower = jnp.roll(self.upper, 1).at[0].set(0)
+        upper = jnp.roll(self.lower, -1).at[-1].set(0)
+        return Tridiagonal(lower, self.diagonal, upper, self.pattern).solve(b)
 
 
-def _refined(multiply: Any, pattern: SquarePattern, eliminated: Any, b: Array) -> Array:
-    x = solve_in_blocks(pattern.block_order, eliminated, b)
-    if pattern.block_order.width == 1:  # with exchanges of rows
-        return x
-    return x + solve_in_blocks(pattern.block_order, eliminated, b - multiply(x))
-
-
-def _blocks(A: SparseMatrix) -> Blocks:
-    """Return the blocks, with ones on the diagonal of rows that complete the last ones."""
-    order = A.pattern.block_order
-    number, width, places = order.num_blocks, order.width, order.own_places
-    i, j = places[A.pattern.rows], places[A.pattern.columns]
-    entries = jnp.zeros((number, 3, width, width), A.entries.dtype)
-    at = i // width, 1 + j // width - i // width, i % width, j % width
-    entries = entries.at[tuple(map(constant, at))].set(A.entries)
-    padded = order.size + np.arange(order.num_padded)
-    at = padded // width, np.ones_like(padded), padded % width, padded % width
-    entries = entries.at[tuple(map(constant, at))].set(1)
-    return Blocks(entries[:, 0], entries[:, 1], entries[:, 2])
+_FACTORS = {"tridiagonal": Tridiagonal.of, "multi-elimination": MultiElimination.of, "klu": KLU.of}

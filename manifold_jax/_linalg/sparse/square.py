@@ -14,6 +14,7 @@ from scipy.sparse.csgraph import maximum_bipartite_matching
 from ..coloring import greedy_colors
 from ..singular_parts import SingularParts
 from .block_order import BlockOrder
+from .elimination_plan import EliminationPlan
 
 
 class SquarePattern:
@@ -61,6 +62,20 @@ class SquarePattern:
     def block_order(self) -> BlockOrder:
         """Return the order in which the matrix is block tridiagonal, with narrow blocks if there is one."""
         return BlockOrder.best(sp.coo_matrix(self._matrix() + self._matrix().T))
+
+    @functools.cached_property
+    def column_of_row(self) -> np.ndarray | None:
+        """Return the columns in whose places rows have to be for a diagonal without zeros; `None` where they are."""
+        if len(self.on_diagonal) == self.size or self.transversal is None:
+            return None
+        column_of_row = np.empty(self.size, np.uint32)
+        column_of_row[self.rows[self.transversal]] = self.columns[self.transversal]
+        return column_of_row
+
+    @functools.cached_property
+    def elimination_plan(self) -> EliminationPlan | None:
+        rows = self.rows if self.column_of_row is None else self.column_of_row[self.rows]
+        return EliminationPlan.of(rows, self.columns, self.size)
 
     def _matrix(self) -> sp.csr_matrix:
         ones = np.ones(self.num_entries, np.int64)
