@@ -122,14 +122,13 @@ class Cell:
             "electrolyte": jnp.full(n + s + p, -at_rest),
         }
 
-    def voltage(self, state: Any, parameters: Parameters) -> Any:
+    def voltage(self, state: Any) -> Any:
         """Return the potential at the end of the positive electrode, extrapolated from two points."""
-        del parameters
         return 1.5 * state["solid"][-1] - 0.5 * state["solid"][-2]
 
     def rates(self, t: Any, state: Any, parameters: Parameters) -> dict[str, Any]:
         del t
-        n, s, p = self.points
+        n, s, _ = self.points
         density = parameters.current / AREA
         salt, solid, electrolyte = state["salt"], state["solid"], state["electrolyte"]
         sides = (
@@ -187,7 +186,7 @@ class Cell:
         n, s, p = self.points
         negative, positive = parameters.negative, parameters.positive
         of_points = lambda values: jnp.concatenate(
-            [jnp.full(k, v) for k, v in zip(self.points, values)]
+            [jnp.full(k, v) for k, v in zip(self.points, values, strict=True)]
         )
         width = of_points([negative.thickness / n, SEPARATOR_THICKNESS / s, positive.thickness / p])
         porosity = of_points([negative.porosity, SEPARATOR_POROSITY, positive.porosity])

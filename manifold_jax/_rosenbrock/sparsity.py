@@ -46,9 +46,9 @@ def choose_sparsity(
     `function` is `f` and whatever else the state has to do with in the equations. `massless` says of
     a diagonal which of its numbers are known to be zero.
 
-    Blocks are eliminated without exchanges of rows between them: right for small steps with a regular
-    mass matrix, and otherwise in general if each equation has an unknown of its own. Each
-    factorization is checked, see [`factorize_sparse`][].
+    A multi-elimination does without exchanges of rows: right for small steps with a regular mass matrix,
+    and otherwise in general if each equation has an unknown of its own. Each factorization is checked, see
+    [`factorize_sparse`][].
     """
     n, is_matrix = x.size, mass is not None and mass.ndim == 2
     if choice == "dense" or (choice == "auto" and (n < SMALLEST or is_matrix)):
