@@ -13,6 +13,11 @@ os.environ.setdefault("XLA_FLAGS", FAST_FLAGS)
 # Tracing makes many small objects that live long: a tenth of its time went into looking at them.
 gc.set_threshold(200_000, 50, 100)
 
+# XLA copies where each operation was written whenever it inlines a function: a tenth of its time for
+# the gradient of a solve. In the environment, too, for the processes that tests start.
+os.environ.setdefault("JAX_TRACEBACK_IN_LOCATIONS_LIMIT", "0")
+jax.config.update("jax_traceback_in_locations_limit", 0)
+
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")

@@ -27,3 +27,11 @@ if "xla_cpu_use_fusion_emitters" in OPTIONS:
 optimized_jit = functools.partial(
     jax.jit, compiler_options={name: usual for name, (_, usual) in OPTIONS.items()}
 )
+# In between, at half of the time for compiling: XLA and LLVM optimize, but less than for users.
+medium_jit = functools.partial(
+    jax.jit,
+    compiler_options={
+        "xla_backend_optimization_level": 1,
+        "xla_llvm_disable_expensive_passes": False,
+    },
+)

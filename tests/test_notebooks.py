@@ -14,7 +14,7 @@ NOTEBOOKS = sorted(Path(__file__).parents[1].glob("notebooks/*.ipynb"))
 COMPILED_FOR_LONG = ("08_from", "13_from", "14_the")
 
 # They run for long, too: the flags between those of the tests and those of a reader.
-COMPILED_AND_RUN_FOR_LONG = ("10_calibration",)
+COMPILED_AND_RUN_FOR_LONG = ("04", "05", "06", "07", "09", "10", "11", "12", "15")
 
 notebooks = pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 
@@ -47,7 +47,7 @@ def test_is_short_and_saved_with_its_output(path):
 @pytest.mark.slow
 @notebooks
 def test_runs_in_a_fresh_kernel(path, tmp_path, monkeypatch):
-    # As a reader runs it: code compiled without optimization is too slow for ten thousand pendulums.
+    # The others as a reader runs them.
     if path.stem.startswith(COMPILED_AND_RUN_FOR_LONG):
         monkeypatch.setenv("XLA_FLAGS", MEDIUM_FLAGS)
     elif not path.stem.startswith(COMPILED_FOR_LONG):
