@@ -14,25 +14,20 @@ from typing import Annotated, Any
 
 import diffrax as dfx
 import jax
-import jax.flatten_util as jfu
 import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
-import optimistix as optx
 import typer
 from rich.table import Table
-from scipy.integrate import solve_ivp
 
 import manifold_jax as mj
 
 from ..tools.measure import environment, make_console, use_double_precision, write_json
-from . import _lithium_ion_pybamm as pybamm
-from ._lithium_ion_model import Cell, CUT_OFF, NEGATIVE, Parameters, POSITIVE
+from . import _lithium_ion_pybamm as pybamm, _lithium_ion_scipy as scipy
+from ._lithium_ion_model import CUT_OFF
+from ._lithium_ion_task import CELL, LAST, outputs, timed, TS, with_diffusivities
 
 
-CELL = Cell()
-LAST = 3700.0
-TS = np.linspace(0.0, 3540.0, 60)
 TOLERANCES = (1e-4, 1e-6, 1e-8)
 NOISE, DRAWS = 2e-3, 20  # V
 BATCH = 1000
@@ -51,50 +46,6 @@ class Row:
     error: float
     end_error: float
     violation: float | None
-
-
-def with_diffusivities(logarithms: Any) -> Parameters:
-    """Return parameters with `exp(logarithms)` times the diffusivities of negative and positive particles."""
-    factors = jnp.exp(jnp.asarray(logarithms))
-    negative = NEGATIVE._replace(diffusivity=NEGATIVE.diffusivity * factors[0])
-    return Parameters(negative, POSITIVE._replace(diffusivity=POSITIVE.diffusivity * factors[1]))
-
-
-def discharge(parameters: Parameters, tolerance: Any, max_steps: int = 8192) -> dfx.Solution:
-    """Solve up to the cut-off; the states at `TS` and at the end."""
-    voltage = lambda t, state, args, **kwargs: CELL.voltage(state) - CUT_OFF
-    return mj.diffeqsolve(
-        CELL.term,
-        mj.Rodas5P(),
-        0.0,
-        LAST,
-        None,
-        CELL.start(parameters),
-        parameters,
-        saveat=dfx.SaveAt(ts=TS, t1=True),
-        stepsize_controller=dfx.PIDController(rtol=tolerance, atol=tolerance),
-        event=dfx.Event(voltage, optx.Newton(rtol=1e-12, atol=1e-12)),
-        max_steps=max_steps,
-        consistent="project",
-        throw=False,
-    )
-
-
-def outputs(logarithms: Any, tolerance: Any) -> tuple[Any, ...]:
-    """Return voltages, the time of the cut-off, steps and the largest algebraic residual."""
-    parameters = with_diffusivities(logarithms)
-    sol = discharge(parameters, tolerance)
-    rates = jax.vmap(lambda state: CELL.rates(0.0, state, parameters))(sol.ys)
-    residual = [jnp.max(jnp.abs(rates[name][: TS.size + 1])) for name in ("solid", "electrolyte")]
-    V = jax.vmap(CELL.voltage)(sol.ys)[: TS.size]
-    return V, sol.ts[TS.size], sol.stats["num_steps"], jnp.maximum(*residual)
-
-
-def timed(function: Any, *args: Any) -> tuple[Any, float]:
-    jax.block_until_ready(function(*args))
-    begin = time.perf_counter()
-    result = jax.block_until_ready(function(*args))
-    return result, time.perf_counter() - begin
 
 
 def compare(console: Any) -> list[Row]:
@@ -118,7 +69,8 @@ def compare(console: Any) -> list[Row]:
             )
         )
     for tolerance in TOLERANCES[1:]:
-        rows.append(by_scipy(tolerance, errors))
+        V, end, steps, seconds = scipy.solve(tolerance)
+        rows.append(Row("SciPy, BDF", tolerance, steps, seconds, None, *errors(V, end), None))
     try:
         for tolerance in (*TOLERANCES[1:], 1e-10):
             V, end, seconds, _ = pybamm.solve(tolerance, TS, LAST)
@@ -128,72 +80,6 @@ def compare(console: Any) -> list[Row]:
     except ImportError:
         console.print('PyBaMM is left out: `pip install "manifold_jax\\[peers]"`.')
     return rows
-
-
-class Eliminated:
-    """The differential unknowns alone, for SciPy: Newton's method finds the algebraic ones."""
-
-    def __init__(self) -> None:
-        self.parameters = Parameters()
-        start, _ = CELL.term.consistent_state(0.0, CELL.start(self.parameters), self.parameters)
-        split = lambda state: (
-            {name: state[name] for name in ("negative", "positive", "salt")},
-            {name: state[name] for name in ("solid", "electrolyte")},
-        )
-        differential, algebraic = split(start)
-        self.y0, unravel = jfu.ravel_pytree(differential)
-        self.guess, unravel_algebraic = jfu.ravel_pytree(algebraic)
-
-        def rates(y: Any, z: Any) -> tuple[Any, Any]:
-            state = {**unravel(y), **unravel_algebraic(z)}
-            parts = split(CELL.rates(0.0, state, self.parameters))
-            return jfu.ravel_pytree(parts[0])[0], jfu.ravel_pytree(parts[1])[0]
-
-        def algebraic_at(y: Any, z: Any) -> Any:
-            residual = lambda z, y: rates(y, z)[1]
-            solver = optx.Newton(rtol=1e-12, atol=1e-12)
-            return optx.root_find(residual, solver, z, args=y, max_steps=50, throw=False).value
-
-        field = lambda y, z: rates(y, algebraic_at(y, z))[0]
-        self.solve_algebraic = jax.jit(algebraic_at)
-        self.field, self.jacobian = jax.jit(field), jax.jit(jax.jacfwd(field))
-        self.voltage = jax.jit(lambda z: CELL.voltage(unravel_algebraic(z)))
-
-    def voltage_at(self, y: Any) -> float:
-        self.guess = self.solve_algebraic(y, self.guess)
-        return float(self.voltage(self.guess))
-
-
-def by_scipy(tolerance: float, errors: Any) -> Row:
-    of = Eliminated()
-
-    def right(t: float, y: Any) -> np.ndarray:
-        of.guess = of.solve_algebraic(y, of.guess)
-        return np.asarray(of.field(y, of.guess))
-
-    def cut_off(t: float, y: Any) -> float:
-        return of.voltage_at(y) - CUT_OFF
-
-    cut_off.terminal = True
-    right(0.0, of.y0)
-    jacobian = lambda t, y: np.asarray(of.jacobian(y, of.guess))
-    jacobian(0.0, of.y0)
-    begin = time.perf_counter()
-    sol = solve_ivp(
-        right,
-        (0.0, LAST),
-        np.asarray(of.y0),
-        method="BDF",
-        jac=jacobian,
-        rtol=tolerance,
-        atol=tolerance,
-        events=cut_off,
-        dense_output=True,
-    )
-    seconds = time.perf_counter() - begin
-    V = np.array([of.voltage_at(sol.sol(t)) for t in TS])
-    found = errors(V, sol.t_events[0][0])
-    return Row("SciPy, BDF", tolerance, sol.t.size - 1, seconds, None, *found, None)
 
 
 def derivatives(console: Any) -> dict[str, Any]:
@@ -231,7 +117,7 @@ def fits() -> dict[str, Any]:
     random = np.random.default_rng(0)
     begin = time.perf_counter()
     found = []
-    for _ in range(DRAWS):
+    for _ in range(DRAWS):  # the functions are the same, so that all of them share a program
         data = np.asarray(truth) + NOISE * random.normal(size=TS.size)
         result = mj.fit(
             _fitted,
@@ -239,7 +125,7 @@ def fits() -> dict[str, Any]:
             TS,
             data,
             y0=_rested,
-            observe=lambda t, state, logarithms: CELL.voltage(state),
+            observe=_measured,
             sigma=NOISE,
             solver=mj.Rodas5P(),
             stepsize_controller=dfx.PIDController(rtol=1e-6, atol=1e-6),
@@ -258,6 +144,10 @@ def fits() -> dict[str, Any]:
 def _fitted(logarithms: Any) -> mj.MassMatrixTerm:
     field = lambda t, state, logarithms: CELL.rates(t, state, with_diffusivities(logarithms))
     return mj.MassMatrixTerm(field, CELL.mass)
+
+
+def _measured(t: Any, state: Any, logarithms: Any) -> Any:
+    return CELL.voltage(state)
 
 
 def _rested(logarithms: Any) -> Any:
@@ -281,7 +171,7 @@ def batch() -> dict[str, Any]:
         "alone_s": alone,
         "steps": int(np.max(steps)),
         "difference": difference,
-        "ended": int(np.isfinite(ends).sum()),
+        "ended": int(np.sum((ends > 0) & (ends < LAST))),
         "ends": [float(ends.min()), float(ends.max())],
     }
 

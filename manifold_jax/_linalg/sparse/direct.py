@@ -102,7 +102,7 @@ class KLU(eqx.Module):
         return jnp.where(error <= tolerance * size, x, jnp.nan)
 
 
-class Tridiagonal(eqx.Module):
+class TridiagonalElimination(eqx.Module):
     """Elimination by the library (LAPACK, cuSPARSE), with exchanges of rows, once for every right-hand side."""
 
     lower: Float[Array, " n"]
@@ -111,12 +111,12 @@ class Tridiagonal(eqx.Module):
     pattern: SquarePattern = eqx.field(static=True)
 
     @staticmethod
-    def of(A: SparseMatrix) -> "Tridiagonal":
+    def of(A: SparseMatrix) -> "TridiagonalElimination":
         order, n = A.pattern.block_order, A.pattern.size
         i, j = order.own_places[A.pattern.rows], order.own_places[A.pattern.columns]
         diagonals = jnp.zeros((3, n), A.entries.dtype)
         diagonals = diagonals.at[constant(j - i + 1), constant(i)].set(A.entries)
-        return Tridiagonal(*diagonals, A.pattern)
+        return TridiagonalElimination(diagonals[0], diagonals[1], diagonals[2], A.pattern)
 
     def solve(self, b: Float[Array, " n"]) -> Float[Array, " n"]:
         order = self.pattern.block_order
@@ -127,7 +127,11 @@ class Tridiagonal(eqx.Module):
     def solve_transposed(self, b: Float[Array, " n"]) -> Float[Array, " n"]:
         lower = jnp.roll(self.upper, 1).at[0].set(0)
         upper = jnp.roll(self.lower, -1).at[-1].set(0)
-        return Tridiagonal(lower, self.diagonal, upper, self.pattern).solve(b)
+        return TridiagonalElimination(lower, self.diagonal, upper, self.pattern).solve(b)
 
 
-_FACTORS = {"tridiagonal": Tridiagonal.of, "multi-elimination": MultiElimination.of, "klu": KLU.of}
+_FACTORS = {
+    "tridiagonal": TridiagonalElimination.of,
+    "multi-elimination": MultiElimination.of,
+    "klu": KLU.of,
+}
