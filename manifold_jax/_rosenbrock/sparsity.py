@@ -14,8 +14,8 @@ from .._linalg.sparse import Choice, dependence, Method, program_of, SquarePatte
 
 
 # Number of unknowns from which on sparse systems are solved as such. A step of the Brusselator with
-# diffusion, in blocks of 2, then takes as long as with dense matrices (64), 0.61 of the time with 96, 1.3
-# times as long with 48; of a ladder, in blocks of 1, 0.45 (64), 0.53 (96) and 0.58 (48). jaxlib 0.10.2.
+# diffusion then takes 0.48 of the time with dense matrices (0.57 with 48, 0.51 with 96), of a ladder, which is
+# tridiagonal, 0.47 (0.64, 0.21); to compile takes twice as long. jaxlib 0.10.2.
 SMALLEST = 64
 # The same for KLU: 1.7 and 1.4 times as long with 100 unknowns, 0.4 and 0.1 with 150.
 SMALLEST_KLU = 128
