@@ -268,6 +268,13 @@ def wide(x):
     return jnp.sum(x[np.random.default_rng(0).integers(x.size, size=(8, x.size))], axis=0)
 
 
+def mesh(x):
+    """Neighbours in two dimensions."""
+    padded = jnp.pad(x.reshape(30, 30), 1)
+    sides = padded[2:, 1:-1] + padded[:-2, 1:-1] + padded[1:-1, 2:] + padded[1:-1, :-2]
+    return (sides - 4 * padded[1:-1, 1:-1]).reshape(-1)
+
+
 @pytest.mark.parametrize(
     ("name", "function", "mass", "klu", "expected"),
     [
@@ -297,6 +304,7 @@ def wide(x):
             True,
             "tridiagonal",
         ),
+        ("mesh", mesh, None, True, "multi-elimination"),
         ("wide", wide, None, False, None),
         ("wide", wide, None, True, "klu"),
         ("a matrix", lambda x: x, np.eye(130), True, None),
@@ -305,7 +313,7 @@ def wide(x):
 )
 def test_choice(monkeypatch, name, function, mass, klu, expected):
     monkeypatch.setattr(sparsity, "has_klu", lambda dtype: klu)
-    x = jnp.ones({"few unknowns": 10, "few for KLU": 70, "wide": 260}.get(name, 130))
+    x = jnp.ones({"few unknowns": 10, "few for KLU": 70, "wide": 260, "mesh": 900}.get(name, 130))
     massless = None if mass is None else np.asarray(mass) == 0
     mass = None if mass is None else jnp.asarray(mass)
     found = sparsity.choose_sparsity("auto", function, x, mass, massless)

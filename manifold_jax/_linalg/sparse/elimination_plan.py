@@ -20,8 +20,6 @@ _MOST_ROUNDS, _MOST_PRODUCTS = 100, 150
 # Updates that cost less than a loop.
 _FEW_UPDATES = 32
 _NONE = 2**31 - 1  # not an index of any array
-# More rounds than this take too long to compile, more products per entry too long to run.
-_MOST_ROUNDS, _MOST_PRODUCTS = 60, 50
 
 
 class Updates(NamedTuple):
@@ -44,9 +42,10 @@ class EliminationPlan:
     - `num_entries`: with those that elimination adds, behind the given ones. Then a zero and a one follow.
     - `diagonal`: numbers of the entries of the diagonal.
     - `products`: `entry[target] -= entry[lower] entry[upper] / entry[pivot]`, the sources being numbers of entries.
-    - `lower`: `x[target] -= entry[number] / entry[pivot] x[k]`, the sources being `number, pivot, k`, for entries below
-        pivots, whose columns are `k`.
-    - `upper`: the same for entries to the right of pivots, whose rows are `k`; `x[k] -= ... x[target]`.
+    - `lower`: entries below pivots: the targets are their rows, the sources their numbers, those of the pivots, and
+        the pivots' columns. `x[target] -= entry[number] / entry[pivot] x[column]`.
+    - `upper`: entries to the right of pivots: the targets are their columns, the sources the same with the pivots'
+        rows. `x[row] -= entry[number] / entry[pivot] x[target]`, in the opposite order.
     - `rest`: the unknowns that are left at the end.
     - `rest_entries`: numbers of the entries of their matrix.
     """

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 
 from ..._base.types import IntScalar
 from .blocks import Pivot
-from .elimination_plan import EliminationPlan
+from .elimination_plan import EliminationPlan, Updates
 from .square import SparseMatrix
 
 
@@ -60,42 +60,41 @@ class MultiElimination(eqx.Module):
         )
 
     def solve(self, b: Float[Array, " n"]) -> Float[Array, " n"]:
-        column_of_row, plan = self.A.pattern.column_of_row, _plan(self.A)
+        plan, column_of_row = _plan(self.A), self.A.pattern.column_of_row
+        lower, upper = _paired(plan.lower, self.lower), _paired(plan.upper, self.upper)
 
         def substitute(b: Array) -> Array:
             if column_of_row is not None:
                 b = _take(b, np.argsort(column_of_row).astype(np.uint32))
-            for updates, entries in zip(plan.lower, self.lower, strict=True):
-                b = _each_round(_subtract, b, updates.targets, updates.sources[2:], entries)
-            x = self._divide(b, self.rest.left, self.rest.right)
-            for updates, entries in reversed(list(zip(plan.upper, self.upper, strict=True))):
-                x = _each_round(
-                    _subtract, x, updates.sources[2], updates.targets[None], entries, reverse=True
-                )
-            return x
+            return self._substitute(lower, self.rest, upper, b)
 
         return self._refine(substitute, self.A.multiply, b)
 
     def solve_transposed(self, b: Float[Array, " n"]) -> Float[Array, " n"]:
-        column_of_row, plan = self.A.pattern.column_of_row, _plan(self.A)
+        plan, column_of_row = _plan(self.A), self.A.pattern.column_of_row
+        lower, upper = _paired(plan.lower, self.lower), _paired(plan.upper, self.upper)
+        rest = Pivot(self.rest.right.T, self.rest.left.T)
 
         def substitute(b: Array) -> Array:
-            for updates, entries in zip(plan.upper, self.upper, strict=True):
-                b = _each_round(_subtract, b, updates.targets, updates.sources[2:], entries)
-            x = self._divide(b, self.rest.right.T, self.rest.left.T)
-            for updates, entries in reversed(list(zip(plan.lower, self.lower, strict=True))):
-                x = _each_round(
-                    _subtract, x, updates.sources[2], updates.targets[None], entries, reverse=True
-                )
+            x = self._substitute(upper, rest, lower, b)
             return x if column_of_row is None else _take(x, column_of_row)
 
         return self._refine(substitute, self.A.multiply_transposed, b)
 
-    def _divide(self, b: Array, first: Array, second: Array) -> Array:
-        """Return `D^-1 b`, whose block of the rest is `second @ first`."""
-        rest = _plan(self.A).rest
-        solved = second @ (first @ _take(b, rest))
-        return (b / self.diagonal).at[rest].set(solved, mode="promise_in_bounds")
+    def _substitute(self, first: list, rest: Pivot, second: list, b: Array) -> Array:
+        """Solve with the unit triangular matrix of `first`, with `D`, and with the transposed matrix of `second`."""
+        for updates, entries in first:
+            b = _each_round(_subtract, b, updates.targets, updates.sources[2:], entries)
+        unknowns = _plan(self.A).rest
+        x = (
+            (b / self.diagonal)
+            .at[unknowns]
+            .set(rest.right @ (rest.left @ _take(b, unknowns)), mode="promise_in_bounds")
+        )
+        for updates, entries in reversed(second):
+            pivots, others = updates.sources[2], updates.targets[None]
+            x = _each_round(_subtract, x, pivots, others, entries, reverse=True)
+        return x
 
     def _refine(self, substitute: Callable, multiply: Callable, b: Array) -> Array:
         def improve(i: Array, x: Array) -> Array:
@@ -109,6 +108,10 @@ def _plan(A: SparseMatrix) -> EliminationPlan:
     plan = A.pattern.elimination_plan
     assert plan is not None  # the method has been chosen because there is one
     return plan
+
+
+def _paired(plan: list[Updates], entries: list[Array]) -> list[tuple[Updates, Array]]:
+    return list(zip(plan, entries, strict=True))
 
 
 def _each_round(
