@@ -48,7 +48,7 @@ def choose_sparsity(
 
     A multi-elimination does without exchanges of rows: right for small steps with a regular mass matrix,
     and otherwise in general if each equation has an unknown of its own. Each factorization is checked, see
-    [`factorize_sparse`][].
+    [`factorize_sparse`][]; where equations have no unknown of their own KLU is there for those that fail.
     """
     n, is_matrix = x.size, mass is not None and mass.ndim == 2
     if choice == "dense" or (choice == "auto" and (n < SMALLEST or is_matrix)):
@@ -75,7 +75,7 @@ def choose_sparsity(
     if can_do_without and pattern.elimination_plan is not None:
         return Sparsity(pattern, "multi-elimination")
     if with_klu and (choice == "sparse" or n >= SMALLEST_KLU):
-        return Sparsity(pattern, "klu")
+        return Sparsity(pattern, "klu" if pattern.elimination_plan is None else "either")
     if choice == "sparse":
         raise ValueError(_NO_LIBRARY)
     return None

@@ -1,6 +1,7 @@
 """Direct solution of sparse systems with any nonsingular matrix."""
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any, Literal, TypeAlias
 
 import equinox as eqx
@@ -16,7 +17,7 @@ from .multi_elimination import MultiElimination
 from .square import constant, multiply_sparse, permutation, SparseMatrix, SquarePattern
 
 
-Method: TypeAlias = Literal["tridiagonal", "multi-elimination", "klu"]
+Method: TypeAlias = Literal["tridiagonal", "multi-elimination", "klu", "either"]
 
 
 def factorize_sparse(A: SparseMatrix, method: Method) -> Factorization:
@@ -28,14 +29,28 @@ def factorize_sparse(A: SparseMatrix, method: Method) -> Factorization:
     fixed, regular = jax.lax.stop_gradient(A), permutation(A.pattern, A.entries.dtype)
     possible = jnp.all(jnp.isfinite(fixed.entries)) & ~fixed.has_empty_lines()
     fixed = _where(possible, fixed, regular)
-    factors = _FACTORS[method](fixed)
-    eps, error = float(jnp.finfo(fixed.entries.dtype).eps), _error(fixed, factors)
-    usable = possible & (error <= eps ** (1 / 4))
-    if isinstance(factors, MultiElimination):
-        num_solves = jnp.where(error <= eps ** (2 / 3), 1, 2)
-        factors = dataclasses.replace(factors, num_solves=num_solves)
+    factors, error = _factored(fixed, method)
+    usable = possible & (error <= _tolerance(fixed))
     A = _where(usable, A, regular)
     return Factorization(A, Checked(factors, usable), usable, multiply_sparse)
+
+
+def _factored(A: SparseMatrix, method: Method) -> tuple[Any, FloatScalar]:
+    """Return factors and the error of the known solution."""
+    factors = _FACTORS[method](A)
+    if method in ("tridiagonal", "klu"):
+        return factors, _error(A, factors)
+    error, few = _error(A, factors), float(jnp.finfo(A.entries.dtype).eps) ** (2 / 3)
+    factors = dataclasses.replace(factors, num_solves=jnp.where(error <= few, 1, 2))
+    if method == "multi-elimination":
+        return factors, error
+    first, second = error <= _tolerance(A), KLU.of(A)
+    error = _unless(first, lambda: _error(A, second), error)
+    return Either(factors, second, first), error
+
+
+def _tolerance(A: SparseMatrix) -> float:
+    return float(jnp.finfo(A.entries.dtype).eps) ** (1 / 4)
 
 
 class Checked(eqx.Module):
@@ -102,6 +117,27 @@ class KLU(eqx.Module):
         return jnp.where(error <= tolerance * size, x, jnp.nan)
 
 
+class Either(eqx.Module):
+    """The elimination without exchanges of rows where it is usable, else that of KLU."""
+
+    first: MultiElimination
+    second: KLU
+    use_first: BoolScalar
+
+    def solve(self, b: Float[Array, " n"]) -> Float[Array, " n"]:
+        x = self.first.solve(b)
+        return _unless(self.use_first, lambda: self.second.solve(b), x)
+
+    def solve_transposed(self, b: Float[Array, " n"]) -> Float[Array, " n"]:
+        x = self.first.solve_transposed(b)
+        return _unless(self.use_first, lambda: self.second.solve_transposed(b), x)
+
+
+def _unless(condition: BoolScalar, value: Callable, otherwise: Array) -> Array:
+    """A loop of no or one iteration: KLU refuses indices that differ in a batch, which `jax.lax.cond` makes of all."""
+    return jax.lax.fori_loop(0, jnp.where(condition, 0, 1), lambda _, x: value(), otherwise)
+
+
 class TridiagonalElimination(eqx.Module):
     """Elimination by the library (LAPACK, cuSPARSE), with exchanges of rows, once for every right-hand side."""
 
@@ -134,4 +170,5 @@ _FACTORS = {
     "tridiagonal": TridiagonalElimination.of,
     "multi-elimination": MultiElimination.of,
     "klu": KLU.of,
+    "either": MultiElimination.of,
 }
