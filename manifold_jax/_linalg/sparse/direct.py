@@ -45,8 +45,8 @@ def _factored(A: SparseMatrix, method: Method) -> tuple[Any, FloatScalar]:
     if method == "multi-elimination":
         return factors, error
     first, second = error <= _tolerance(A), KLU.of(A)
-    error = _unless(first, lambda: _error(A, second), error)
-    return Either(factors, second, first), error
+    of_second = lambda entries: _error(SparseMatrix(entries, A.pattern), second)
+    return Either(factors, second, first), _unless(first, of_second, A.entries, error)
 
 
 def _tolerance(A: SparseMatrix) -> float:
@@ -126,16 +126,18 @@ class Either(eqx.Module):
 
     def solve(self, b: Float[Array, " n"]) -> Float[Array, " n"]:
         x = self.first.solve(b)
-        return _unless(self.use_first, lambda: self.second.solve(b), x)
+        return _unless(self.use_first, self.second.solve, b, x)
 
     def solve_transposed(self, b: Float[Array, " n"]) -> Float[Array, " n"]:
         x = self.first.solve_transposed(b)
-        return _unless(self.use_first, lambda: self.second.solve_transposed(b), x)
+        return _unless(self.use_first, self.second.solve_transposed, b, x)
 
 
-def _unless(condition: BoolScalar, value: Callable, otherwise: Array) -> Array:
-    """A loop of no or one iteration: KLU refuses indices that differ in a batch, which `jax.lax.cond` makes of all."""
-    return jax.lax.fori_loop(0, jnp.where(condition, 0, 1), lambda _, x: value(), otherwise)
+def _unless(condition: BoolScalar, function: Callable, x: Array, otherwise: Array) -> Array:
+    """Return `function(x)`, or what is there already. A loop of one iteration or none: KLU refuses indices that
+    differ in a batch, which `jax.lax.cond` makes of all. What does not depend on `i` would be moved out of it."""
+    body = lambda i, _: function(jnp.where(i == 0, x, 0))
+    return jax.lax.fori_loop(0, jnp.where(condition, 0, 1), body, otherwise)
 
 
 class TridiagonalElimination(eqx.Module):
