@@ -151,7 +151,7 @@ def test_mistakes_are_explained(arguments, message):
 def test_command(tmp_path):
     """A conserved quantity as constraint, and the parameters in it."""
     file = tmp_path / "certificate.json"
-    options = "--t1 3 --methods projected --adjoints forward,checkpointed,replay,backsolve".split()
+    options = "--t1 3 --methods tangent --adjoints forward,checkpointed,replay,backsolve".split()
     options += ["--hessian", "--json"]
     result = run("rigid-body", *options, str(file))
     assert result.exit_code == 0, result.output

@@ -127,10 +127,9 @@ class Rodas5P(AbstractRosenbrock):
         is found from the traced vector field, the Jacobian has one column for all unknowns of a
         color, and unknowns that no equation couples are eliminated at the same time, without exchanges
         of rows (a tridiagonal matrix by LAPACK). Where that takes too long, or is not accurate because
-        algebraic equations do not contain the unknowns in their places, KLU does it if klujax is
-        installed (the extra `sparse`; CPUs and 64-bit numbers). `"auto"` does so from 64 unknowns on
-        (KLU: 128) where the structure allows,
-        `"dense"` never, `"sparse"` always, with an error where it cannot. Masses that are matrices are sparse only
+        of algebraic equations, KLU does it if klujax is installed (the extra `sparse`; CPUs and 64-bit
+        numbers). `"auto"` does so from 64 unknowns on (KLU: 128) where the structure allows, `"dense"`
+        never, `"sparse"` always, with an error where it cannot. Masses that are matrices are sparse only
         on request, and with rows of zeros for the algebraic equations. Sparse matrices and indices
         in `f` should be NumPy arrays that the function closes over: in `args` they are not known.
 

@@ -46,9 +46,9 @@ def choose_sparsity(
     `function` is `f` and whatever else the state has to do with in the equations. `massless` says of
     a diagonal which of its numbers are known to be zero.
 
-    A multi-elimination does without exchanges of rows: right for small steps with a regular mass matrix,
-    and otherwise in general if each equation has an unknown of its own. Each factorization is checked, see
-    [`factorize_sparse`][]; where equations have no unknown of their own KLU is there for those that fail.
+    A multi-elimination does without exchanges of rows: right for small steps with a regular mass matrix.
+    Algebraic equations may need exchanges, whatever their structure, and have KLU for them if it is installed.
+    Each factorization is checked, see [`factorize_sparse`][].
     """
     n, is_matrix = x.size, mass is not None and mass.ndim == 2
     if choice == "dense" or (choice == "auto" and (n < SMALLEST or is_matrix)):
@@ -71,11 +71,14 @@ def choose_sparsity(
     needs_no_exchanges = is_regular or len(pattern.on_diagonal) == n
     if pattern.block_order.width == 1:
         return Sparsity(pattern, "tridiagonal")
-    can_do_without = needs_no_exchanges or (choice == "sparse" and not with_klu)
-    if can_do_without and pattern.elimination_plan is not None:
+    has_plan = pattern.elimination_plan is not None
+    may_use_klu = with_klu and (choice == "sparse" or n >= SMALLEST_KLU)
+    if has_plan and may_use_klu and not is_regular:
+        return Sparsity(pattern, "either")
+    if has_plan and (needs_no_exchanges or choice == "sparse"):
         return Sparsity(pattern, "multi-elimination")
-    if with_klu and (choice == "sparse" or n >= SMALLEST_KLU):
-        return Sparsity(pattern, "klu" if pattern.elimination_plan is None else "either")
+    if may_use_klu:
+        return Sparsity(pattern, "klu")
     if choice == "sparse":
         raise ValueError(_NO_LIBRARY)
     return None

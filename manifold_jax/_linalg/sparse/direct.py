@@ -13,6 +13,8 @@ from jaxtyping import Array, Float
 from ..._base.klu import klujax
 from ..._base.types import BoolScalar, FloatScalar
 from ..dense import Factorization
+from .elimination import Blocks, eliminate
+from .factorization import solve_in_blocks
 from .multi_elimination import MultiElimination
 from .square import constant, multiply_sparse, permutation, SparseMatrix, SquarePattern
 
@@ -141,31 +143,26 @@ def _unless(condition: BoolScalar, function: Callable, x: Array, otherwise: Arra
 
 
 class TridiagonalElimination(eqx.Module):
-    """Elimination by the library (LAPACK, cuSPARSE), with exchanges of rows, once for every right-hand side."""
+    """Elimination in blocks of one, by the library with exchanges of rows, once for every right-hand side."""
 
-    lower: Float[Array, " n"]
-    diagonal: Float[Array, " n"]
-    upper: Float[Array, " n"]
+    blocks: Blocks
     pattern: SquarePattern = eqx.field(static=True)
 
     @staticmethod
     def of(A: SparseMatrix) -> "TridiagonalElimination":
-        order, n = A.pattern.block_order, A.pattern.size
+        order = A.pattern.block_order
         i, j = order.own_places[A.pattern.rows], order.own_places[A.pattern.columns]
-        diagonals = jnp.zeros((3, n), A.entries.dtype)
-        diagonals = diagonals.at[constant(j - i + 1), constant(i)].set(A.entries)
-        return TridiagonalElimination(diagonals[0], diagonals[1], diagonals[2], A.pattern)
+        diagonals = jnp.zeros((3, order.num_blocks, 1, 1), A.entries.dtype)
+        diagonals = diagonals.at[1, order.size :].set(1)  # rows that complete the blocks
+        diagonals = diagonals.at[constant(j - i + 1), constant(i), 0, 0].set(A.entries)
+        blocks = Blocks(diagonals[0], diagonals[1], diagonals[2])
+        return TridiagonalElimination(blocks, A.pattern)
 
     def solve(self, b: Float[Array, " n"]) -> Float[Array, " n"]:
-        order = self.pattern.block_order
-        right = order.ordered(b)[:, None]
-        x = jax.lax.linalg.tridiagonal_solve(self.lower, self.diagonal, self.upper, right)
-        return order.out_of_blocks(x)
+        return solve_in_blocks(self.pattern.block_order, eliminate(self.blocks), b)
 
     def solve_transposed(self, b: Float[Array, " n"]) -> Float[Array, " n"]:
-        lower = jnp.roll(self.upper, 1).at[0].set(0)
-        upper = jnp.roll(self.lower, -1).at[-1].set(0)
-        return TridiagonalElimination(lower, self.diagonal, upper, self.pattern).solve(b)
+        return TridiagonalElimination(self.blocks.transposed(), self.pattern).solve(b)
 
 
 _FACTORS = {

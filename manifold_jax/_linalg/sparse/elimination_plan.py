@@ -14,8 +14,8 @@ _FEW, _MANY = 12, 96
 _SMALL_ROUND = 4
 # Pivots of a round have at most twice as many neighbours as the one with the fewest, and one more.
 _SLACK = 2
-# More rounds, or products for each entry, take too long to find and to run; KLU takes three times as long for a mesh
-# of 40 x 40, with 54 rounds and 112 products for each entry.
+# More rounds, or products for each entry, take too long to find and to run; KLU takes two to three times as long for
+# a mesh of 40 x 40, with 54 rounds and 112 products for each entry.
 _MOST_ROUNDS, _MOST_PRODUCTS = 100, 150
 # Updates that cost less than a loop.
 _FEW_UPDATES = 32
