@@ -254,8 +254,53 @@ def test_iterations_that_are_too_few():
     assert "Write more `max_iterations`" in found.message
 
 
+def test_a_turn_that_is_repeated():
+    """A point that follows one that moves at a constant rate is where that is, also at the first time."""
+    T = TIMES[-1]
+    rate = 2 * np.pi / T
+    target = lambda t: jnp.stack([jnp.cos(rate * t + 0.1), jnp.sin(rate * t + 0.1)])
+    found = turn(
+        y0=on_circle(0.4),
+        goal=None,
+        periodic=True,
+        inputs=np.arange(5.0)[:, None],
+        states=on_circle(0.4 + rate * TIMES).T,
+        cost=lambda t, y, u: u @ u + 3 * jnp.sum((y - target(t)) ** 2),
+        steps=8,
+    )
+    np.testing.assert_allclose(found.inputs, rate, atol=1e-5)
+    np.testing.assert_allclose(found.ys[0], on_circle(0.1), atol=1e-6)
+    np.testing.assert_array_equal(found.ys[0], found.ys[-1])
+    np.testing.assert_array_equal(found.inputs[0], found.inputs[-1])
+    assert found.gap < 1e-9
+
+
+def test_a_forced_oscillation():
+    """The steady state of a damped oscillator on a line, whose initial state is not known."""
+    rate = np.pi
+    along = lambda t, q, v, u: jnp.cos(rate * t) - 4 * q[1] - 0.6 * v[1] + u[0]
+    force = lambda *given: jnp.stack([jnp.zeros(()), along(*given)])
+    slider = mj.MechanicalSystem(1.0, lambda t, q, u: q[0] - 1, force)
+    ts = np.array([0.0, 0.4, 0.7, 1.2, 1.5, 2.0])
+    found = mj.optimize_trajectory(
+        *(slider.terms, slider.constraint, ts, (jnp.array([1.0, 0.3]), jnp.zeros(2))),
+        *(np.zeros((6, 1)),),
+        cost=effort,
+        periodic=True,
+        steps=16,
+    )
+    amplitude = 1 / (4 - rate**2 + 0.6j * rate)
+    exact = (
+        np.real(amplitude * np.exp(1j * rate * ts)),
+        np.imag(-rate * amplitude * np.exp(1j * rate * ts)),
+    )
+    for state, expected in zip(found.ys, exact, strict=True):
+        np.testing.assert_allclose(state[:, 1], expected, atol=1e-6)
+    assert found.cost < 1e-12
+
+
 @functools.cache
-def transcription():
+def transcription(periodic=False):
     """Wind that changes with time, a final cost, a goal that is a function, and a path constraint."""
     push = lambda t, q, v, u: jnp.concatenate([u, jnp.sin(2 * t)[None] - GRAVITY]) - 0.3 * v
     ball = mj.MechanicalSystem(1.0, lambda t, q, u: q @ q - 1, push)
@@ -271,14 +316,15 @@ def transcription():
     v -= np.sum(q * v, axis=1, keepdims=True) * q
     us = random.standard_normal((4, 2))
     charts = Charts.around(shooting, np.array([0.0, 0.3, 0.7, 1.2]), np.append(q, v, axis=1), us)
-    found = Transcription.of(shooting, charts, 2, ends_free=True)
+    found = Transcription.of(shooting, charts, 2, ends_free=True, periodic=periodic)
     at = 0.1 * random.standard_normal(found.size)
     at[found.inputs] += us
     return found, at, random
 
 
-def test_derivatives():
-    T, v, random = transcription()
+@pytest.mark.parametrize("periodic", [False, True])
+def test_derivatives(periodic):
+    T, v, random = transcription(periodic)
     along, h = random.standard_normal(T.size), 1e-5
     central = lambda f: (f(v + h * along) - f(v - h * along)) / (2 * h)
     np.testing.assert_allclose(T.jacobian(v) @ along, central(T.residual), atol=1e-8)
@@ -292,9 +338,12 @@ def test_derivatives():
     np.testing.assert_allclose(hessian.at(v + step, multipliers) @ step, expected, atol=1e-10)
 
 
-def test_new_charts_change_nothing():
-    T, v, _random = transcription()
+@pytest.mark.parametrize("periodic", [False, True])
+def test_new_charts_change_nothing(periodic):
+    T, v, _random = transcription(periodic)
     new, moved, turn = T.recentered(v)
+    for each in (T.at(v).knots.x, new.at(moved).knots.x):
+        assert np.array_equal(each[0], each[-1]) == periodic
     np.testing.assert_allclose(new.at(moved).knots.x, T.at(v).knots.x, atol=1e-14)
     assert new.cost(moved) == pytest.approx(T.cost(v), abs=1e-13)
     np.testing.assert_allclose(
@@ -355,6 +404,7 @@ def test_gaps_of_states_on_the_far_side():
             ValueError,
             "`path_constraint` must return a number or",
         ),
+        (dict(periodic=True), ValueError, "`goal` must be a function or None where"),
         (dict(states=jnp.zeros((4, 2))), ValueError, "`states` must have the shapes"),
         (dict(states=jnp.zeros((5, 2))), ValueError, "No guess of the state at t = 0.2"),
     ],
@@ -362,6 +412,14 @@ def test_gaps_of_states_on_the_far_side():
 def test_bad_input(changed, error, message):
     with pytest.raises(error, match=message):
         turn(**changed)
+
+
+def test_a_manifold_that_does_not_repeat():
+    moving = mj.Constraint(lambda t, y, u: y @ y - 1 - t)
+    with pytest.raises(ValueError, match="`periodic=True` needs a `constraint` that is the same"):
+        mj.optimize_trajectory(
+            *(TURNING, moving, TIMES, on_circle(0.3), np.ones((5, 1))), cost=effort, periodic=True
+        )
 
 
 @pytest.mark.parametrize(

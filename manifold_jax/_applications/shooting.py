@@ -107,6 +107,11 @@ class Charts(NamedTuple):
         bases = np.swapaxes(right[:, rank:], 1, 2)
         return Charts(*map(jnp.asarray, (ts, xs, bases)))
 
+    def closed(self) -> "Charts":
+        """Return the same with the chart of the first knot at the last one."""
+        centers, bases = (x.at[-1].set(x[0]) for x in (self.centers, self.bases))
+        return Charts(self.ts, centers, bases)
+
 
 class Knots(NamedTuple):
     """The states at all knots, and their derivatives by the tangent coordinates."""

@@ -23,6 +23,7 @@ from .trajectory_arguments import (
     check_guess,
     check_number,
     check_path_constraint,
+    check_periodic,
     check_setting,
     checked_bounds,
     checked_goal,
@@ -75,6 +76,7 @@ def optimize_trajectory(
     cost: Any,
     final_cost: Any = None,
     goal: Any = None,
+    periodic: bool = False,
     path_constraint: Any = None,
     bounds: Any = (-np.inf, np.inf),
     states: Y | None = None,
@@ -111,6 +113,8 @@ def optimize_trajectory(
     - `final_cost`: `c_1(y)`, one number.
     - `goal`: the last state, on the manifold; or a function of it that returns an array of what must be
         zero: numbers that are independent on the manifold.
+    - `periodic`: find a motion that ends with the state and the inputs with which it begins. `y0` is a guess then.
+        Where nothing forbids it, the cheapest one may be rest: say by `path_constraint` where it passes.
     - `path_constraint`: `h(t, y, u)`, a number or an array of shape `(s,)` that must not be positive at any of `ts`:
         bounds on states, distances to obstacles, powers of motors. Between the times it is not looked at.
     - `bounds`: lower and upper bounds of the inputs, numbers or of shape `(m,)`; infinite without.
@@ -152,6 +156,9 @@ def optimize_trajectory(
     if path_constraint is not None:
         check_path_constraint(path_constraint, ts[0], y0, u[0])
     is_state = goal is not None and not callable(goal)
+    if periodic:
+        check_periodic(is_state, y0, constraint, ts[-1], u[0])
+        u = np.append(u[:-1], u[:1], axis=0)
     if is_state:
         goal = checked_goal(goal, y0, constraint, ts[-1], u[-1])
     elif goal is not None and getattr(eqx.filter_eval_shape(goal, y0), "ndim", 2) > 1:
@@ -169,12 +176,14 @@ def optimize_trajectory(
         steps,
     )
     guess = guess_states(shooting, ts, y0, u, goal if is_state else None, states)
+    if periodic:
+        guess[-1] = guess[0]
     charts = Charts.around(shooting, ts, guess, u)
     if charts.bases.shape[2] == 0:
         raise ValueError(
             "`constraint` has as many independent equations as `y0` has numbers: nothing can move."
         )
-    transcription = Transcription.of(shooting, charts, u.shape[1], ends_free=not is_state)
+    transcription = Transcription.of(shooting, charts, u.shape[1], not is_state, periodic)
     found = _solved(transcription, u, limits, max_iterations, tolerance)
     if throw and not found.success:
         raise RuntimeError(found.message)

@@ -98,6 +98,21 @@ def checked_goal(goal: Y, y0: Y, constraint: AbstractConstraint, t: Any, u: Any)
     return there
 
 
+def check_periodic(
+    goal_is_state: bool, y0: Y, constraint: AbstractConstraint, t: Any, u: Any
+) -> None:
+    if goal_is_state:
+        raise ValueError(
+            "`goal` must be a function or None where `periodic=True`: the last state is the first one."
+        )
+    _, info = consistent_state(constraint, t, y0, u, throw=False)
+    if not bool(info.success) or not float(info.correction) <= _ON_MANIFOLD:
+        raise ValueError(
+            "`periodic=True` needs a `constraint` that is the same at the first and the last of `ts`: `y0` does not satisfy it "
+            "at the last one. Let `ts` end where the constraint repeats."
+        )
+
+
 def check_guess(ts: np.ndarray, now: Evaluation) -> None:
     """Refuse a guess from which no optimizer can start, and say why."""
     ends, last, path = now.ends, now.last, now.path

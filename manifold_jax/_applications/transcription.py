@@ -53,16 +53,27 @@ class Transcription:
     _iterate: Any = None
 
     @staticmethod
-    def of(shooting: Shooting, charts: Charts, m: int, ends_free: bool) -> "Transcription":
+    def of(
+        shooting: Shooting, charts: Charts, m: int, ends_free: bool, periodic: bool = False
+    ) -> "Transcription":
+        """Return the problem whose first state is given, and unless `ends_free` the last one, too; or the periodic
+        one, at whose last time state and inputs are the unknowns of the first."""
         K, _, d = charts.bases.shape
-        knots = np.full((K, d), -1)
-        count = K - 1 if ends_free else K - 2
-        knots[1 : count + 1] = np.arange(count * d).reshape(count, d)
-        return Transcription(shooting, charts, knots, count * d + np.arange(K * m).reshape(K, m))
+        knots, inputs = np.full((K, d), -1), np.arange(K * m).reshape(K, m)
+        count, first = K - 1 if ends_free else K - 2, 0 if periodic else 1
+        knots[first : count + first] = np.arange(count * d).reshape(count, d)
+        if periodic:
+            knots[-1], inputs[-1] = knots[0], inputs[0]
+            charts = charts.closed()
+        return Transcription(shooting, charts, knots, count * d + inputs)
 
     @property
     def size(self) -> int:
         return int(self.inputs.max()) + 1
+
+    @property
+    def is_periodic(self) -> bool:
+        return bool(np.all(self.knots[0] == self.knots[-1]) and self.knots[0, 0] >= 0)
 
     @property
     def places(self) -> np.ndarray:
@@ -155,6 +166,8 @@ class Transcription:
         now = self.at(v)
         given = self.shooting, self.charts.ts, now.knots.x, now.u
         charts = Charts.around(*given, dimension=self.knots.shape[1])
+        if self.is_periodic:
+            charts = charts.closed()
         turn = np.einsum("knd,kne->kde", charts.bases, now.knots.by_z)
         moved = v.copy()
         moved[: self.inputs[0, 0]] = 0
