@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import matplotlib as mpl
+import matplotlib.figure
 import multibody_cases as cases
 import numpy as np
 import pytest
@@ -95,3 +96,10 @@ def test_draw_and_animate(crank, tmp_path):
         robot.animate(states, tmp_path / "film.png")
     with pytest.raises(ValueError, match="`point` names the body 'foot'"):
         robot.draw(states, markers={"toe": ("foot", (0.0, 0.0))})
+
+
+def test_axes_with_three_dimensions_are_refused(crank):
+    robot, states = crank
+    axes = mpl.figure.Figure().add_subplot(projection="3d")
+    with pytest.raises(ValueError, match="`ax` must be axes with two dimensions"):
+        robot.draw(states, ax=axes)

@@ -14,7 +14,7 @@ NOTEBOOKS = sorted(Path(__file__).parents[1].glob("notebooks/*.ipynb"))
 COMPILED_FOR_LONG = ("08_from", "13_from", "14_the")
 
 # They run for long, too: the flags between those of the tests and those of a reader.
-COMPILED_AND_RUN_FOR_LONG = ("04", "05", "06", "07", "09", "10", "11", "12", "15")
+COMPILED_AND_RUN_FOR_LONG = ("04", "05", "06", "07", "09", "10", "11", "12", "15", "16")
 
 notebooks = pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 

@@ -87,6 +87,10 @@ def _body_line(center: np.ndarray, points: list[np.ndarray], planar: bool) -> np
 
 def draw_outline(outline: Outline, ax: Any, frame: int) -> list[Any]:
     """Draw one of the states, and the whole paths of the markers, and return what moves."""
+    if hasattr(ax, "get_zlim"):
+        raise ValueError(
+            "`ax` must be axes with two dimensions, such as those of `plt.subplots()`: mechanisms in space are drawn as they are seen."
+        )
     artists = []
     for line, color in zip(outline.bodies, _COLORS * len(outline.bodies), strict=False):
         artists += ax.plot(*line[frame].T, "o-", color=color, linewidth=3, markersize=5)
