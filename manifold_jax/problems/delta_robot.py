@@ -36,7 +36,16 @@ class DeltaRobotArgs(NamedTuple):
     gravity: Any
 
 
-def assembly(args: DeltaRobotArgs) -> Assembly:
+class Parts(NamedTuple):
+    """Bodies, joints, springs in the hinges, and the acceleration of gravity."""
+
+    bodies: list[Body]
+    joints: list[Revolute | Distance]
+    springs: list[JointSpring]
+    gravity: Any
+
+
+def parts(args: DeltaRobotArgs) -> Parts:
     """Return the robot as drawn: arms horizontal, with the platform hanging on its rods."""
     L, r = args.arm_length, args.platform_radius
     depth = jnp.sqrt(args.rod_length**2 - (args.base_radius + L - r) ** 2)
@@ -60,8 +69,12 @@ def assembly(args: DeltaRobotArgs) -> Assembly:
         springs.append(JointSpring(f"hinge of {name}", args.stiffness))
     disc = args.platform_mass * r**2 / 4 * jnp.asarray([1.0, 1.0, 2.0], L.dtype)
     bodies.append(Body("platform", args.platform_mass, disc, position=center))
-    weight = jnp.stack([zero, zero, -args.gravity])
-    return Assembly(bodies, joints, springs, gravity=weight)
+    return Parts(bodies, joints, springs, jnp.stack([zero, zero, -args.gravity]))
+
+
+def assembly(args: DeltaRobotArgs) -> Assembly:
+    bodies, joints, springs, gravity = parts(args)
+    return Assembly(bodies, joints, springs, gravity=gravity)
 
 
 def _initial_state(args: DeltaRobotArgs, start: State) -> State:
