@@ -31,8 +31,10 @@ class WithMujoco:
 
     def __init__(self, h: float):
         import mujoco
+        from absl import logging
         from mujoco import sysid
 
+        logging.set_verbosity(logging.ERROR)  # that there are no sensors
         self.mujoco, self.sysid, self.h = mujoco, sysid, h
         self.rollouts = self.jacobians = 0
         self.spec = self._spec()
