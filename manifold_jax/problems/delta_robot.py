@@ -36,7 +36,7 @@ class DeltaRobotArgs(NamedTuple):
     gravity: Any
 
 
-class Parts(NamedTuple):
+class RobotParts(NamedTuple):
     """Bodies, joints, springs in the hinges, and the acceleration of gravity."""
 
     bodies: list[Body]
@@ -45,7 +45,7 @@ class Parts(NamedTuple):
     gravity: Any
 
 
-def parts(args: DeltaRobotArgs) -> Parts:
+def parts(args: DeltaRobotArgs) -> RobotParts:
     """Return the robot as drawn: arms horizontal, with the platform hanging on its rods."""
     L, r = args.arm_length, args.platform_radius
     depth = jnp.sqrt(args.rod_length**2 - (args.base_radius + L - r) ** 2)
@@ -69,7 +69,7 @@ def parts(args: DeltaRobotArgs) -> Parts:
         springs.append(JointSpring(f"hinge of {name}", args.stiffness))
     disc = args.platform_mass * r**2 / 4 * jnp.asarray([1.0, 1.0, 2.0], L.dtype)
     bodies.append(Body("platform", args.platform_mass, disc, position=center))
-    return Parts(bodies, joints, springs, jnp.stack([zero, zero, -args.gravity]))
+    return RobotParts(bodies, joints, springs, jnp.stack([zero, zero, -args.gravity]))
 
 
 def assembly(args: DeltaRobotArgs) -> Assembly:
