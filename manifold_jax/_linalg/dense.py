@@ -11,12 +11,12 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import jax.scipy.linalg as jsl
 import numpy as np
 from jaxtyping import Array, Float, Inexact
 
 from .._base.derivative_rule import ForwardRule
 from .._base.types import BoolScalar, FloatScalar
+from . import lapack
 from .elimination import eliminate, invert, rank_threshold
 
 
@@ -53,10 +53,10 @@ class Library(eqx.Module):
     lu: tuple[Inexact[Array, "m m"], Array]
 
     def solve(self, b: Inexact[Array, "m ..."]) -> Inexact[Array, "m ..."]:
-        return jsl.lu_solve(self.lu, b)
+        return lapack.lu_solve(*self.lu, b)
 
     def solve_transposed(self, b: Inexact[Array, "m ..."]) -> Inexact[Array, "m ..."]:
-        return jsl.lu_solve(self.lu, b, trans=1)
+        return lapack.lu_solve_transposed(*self.lu, b)
 
 
 class Inverse(eqx.Module):
@@ -116,7 +116,7 @@ def factorize(A: Float[Array, "m m"]) -> Factorization:
     """
     m, fixed = A.shape[0], jax.lax.stop_gradient(A)
     if m > UNROLL_LIMIT:
-        pivots = jnp.diagonal(jsl.lu_factor(_equilibrated(A))[0])
+        pivots = jnp.diagonal(lapack.lu_factor(_equilibrated(A))[0])
         return _factorize_by_library(A, jnp.all(jnp.abs(pivots) > rank_threshold(A)))
     return Factorization(A, *eliminate(fixed), _product)
 
@@ -145,7 +145,7 @@ def pseudo_invert(A: Float[Array, "m m"], dependent: Any = DEPENDENCE_THRESHOLD)
 def _pseudo_inverse(A: Float[Array, "m m"], dependent: FloatScalar) -> Float[Array, "m m"]:
     """Return the pseudo-inverse of a symmetric matrix. (The derivative of `jnp.linalg.pinv` cannot be
     differentiated again if `rtol` is an array.)"""
-    values, V = jnp.linalg.eigh(A, symmetrize_input=False)
+    values, V = lapack.eigh(A)
     used = jnp.abs(values) > dependent * jnp.max(jnp.abs(values))
     return (V * jnp.where(used, 1 / jnp.where(used, values, 1), 0)[None, :]) @ V.T
 
@@ -163,7 +163,7 @@ def factorize_positive(A: Float[Array, "m m"]) -> Factorization:
     """Factor a symmetric matrix; its rank counts as full if it is positive definite."""
     if A.shape[0] <= UNROLL_LIMIT:
         return factorize(A)  # requires positive pivots, too
-    lower = jnp.linalg.cholesky(_equilibrated(A))
+    lower = lapack.cholesky(_equilibrated(A))
     positive = jnp.all(jnp.diagonal(lower) ** 2 > rank_threshold(A))  # NaN unless positive definite
     return _factorize_by_library(A, positive)
 
@@ -175,7 +175,7 @@ def _equilibrated(A: Float[Array, "m m"]) -> Float[Array, "m m"]:
 
 def _factorize_by_library(A: Float[Array, "m m"], full_rank: BoolScalar) -> Factorization:
     A = jnp.where(full_rank, A, jnp.eye(A.shape[0], dtype=A.dtype))
-    factors = Library(jsl.lu_factor(jax.lax.stop_gradient(A)))
+    factors = Library(lapack.lu_factor(jax.lax.stop_gradient(A)))
     return Factorization(A, factors, full_rank, _product)
 
 

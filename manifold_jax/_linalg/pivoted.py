@@ -6,10 +6,10 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import jax.scipy.linalg as jsl
 from jaxtyping import Array, Float, Inexact
 
 from .._base.types import BoolScalar, FloatScalar
+from . import lapack
 from .dense import Factorization, Library, rank_threshold, UNROLL_LIMIT
 from .rows import combine, multiply
 
@@ -58,7 +58,7 @@ def factorize_pivoted(
 
 
 def _lapack(A: Inexact[Array, "n n"]) -> tuple[Library, BoolScalar]:
-    lu, pivots = jsl.lu_factor(A)
+    lu, pivots = lapack.lu_factor(A)
     nonsingular = jnp.all(jnp.isfinite(lu)) & jnp.all(jnp.diagonal(lu) != 0)
     lu = jnp.where(nonsingular, lu, jnp.eye(A.shape[0], dtype=A.dtype))
     pivots = jnp.where(nonsingular, pivots, jnp.arange(A.shape[0], dtype=pivots.dtype))
@@ -131,7 +131,7 @@ def factorize_equilibrated(A: Float[Array, "n n"]) -> Factorization:
         factors = InverseFactor(reduction(scaled)[0], multiply)
         full_rank = jnp.max(jnp.abs(factors.inverse)) * threshold < 1  # false for NaN
     else:
-        factors = Library(jsl.lu_factor(scaled))
+        factors = Library(lapack.lu_factor(scaled))
         full_rank = jnp.all(jnp.abs(jnp.diagonal(factors.lu[0])) > threshold)
     return Factorization(A, Equilibrated(rows, columns, factors), full_rank, multiply)
 
@@ -144,12 +144,7 @@ def factorize_by_reduction(A: Float[Array, "n n"]) -> Factorization:
 
 def reduction(A: Float[Array, "n k"]) -> tuple[Float[Array, "n n"], FloatScalar]:
     """Return `E` with `E A = 1` (or `[1; 0]` if `k < n`) and the sign of `det E`, by Gauss-Jordan
-    elimination with row exchanges. The result is not finite if the columns of `A` are dependent.
-
-    Without LAPACK: batched factorizations can deadlock on the CPU. Seen with jaxlib 0.10.2 on two
-    cores: two independent ones under `vmap` in one large program each held a thread of XLA's pool and
-    waited there for tasks in the queue of the pool.
-    """
+    elimination with row exchanges. The result is not finite if the columns of `A` are dependent."""
     n, k = A.shape
     rows = jnp.arange(n)
 

@@ -92,9 +92,6 @@ class SimplifiedNewton(NamedTuple):
         defined = jnp.all(jnp.isfinite(f0)) & jnp.all(jnp.isfinite(J))
         shifted = jax.lax.complex(MU.real * mass - J, MU.imag * mass)
         real = factorize_pivoted(GAMMA * mass - J)
-        # One after the other: independent batched factorizations by LAPACK can deadlock on the CPU (see
-        # `reduction` in `_linalg/pivoted.py`).
-        shifted = jnp.where(real.usable, shifted, jnp.eye(f0.size, dtype=shifted.dtype))
         return SimplifiedNewton(f0, M, real, factorize_pivoted(shifted), defined)
 
     @property
@@ -106,8 +103,7 @@ class SimplifiedNewton(NamedTuple):
         of `A^-1` (Hairer & Wanner, Solving ODEs II, IV.8)."""
         first, second, third = constant(T_INVERSE, R) @ R
         first = self.real.factors.solve(first)
-        # For the same reason the other one waits for the first; finite numbers are not changed.
-        pair = self.complex.factors.solve(jax.lax.complex(second + 0 * first, third))
+        pair = self.complex.factors.solve(jax.lax.complex(second, third))
         parts = jnp.stack([first, pair.real, pair.imag])
         return constant(T, R) @ parts
 

@@ -25,6 +25,7 @@ from jaxtyping import Array, Float
 from .._base.closure import convert_closure
 from .._base.types import BoolScalar, FloatScalar, IntScalar, RealScalarLike
 from .._constraint.projection_info import ProjectionInfo
+from .._linalg.lapack import singular_values
 from .._linalg.newton import root_of_step
 from .._linalg.pivoted import factorize_pivoted
 from .._linalg.sparse import Choice
@@ -132,7 +133,7 @@ def _is_nonsingular(A: Float[Array, "n n"]) -> BoolScalar:
     for axis in (1, 0):
         size = jnp.max(jnp.abs(A), axis=axis, keepdims=True)
         A = A / jnp.where(size > 0, size, 1)
-    values = jnp.linalg.svd(A, compute_uv=False)
+    values = singular_values(jax.lax.stop_gradient(A))
     return values[-1] > 100 * A.shape[0] * jnp.finfo(A.dtype).eps * values[0]
 
 

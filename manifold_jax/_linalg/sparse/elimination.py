@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from ..lapack import tridiagonal_solve
 from .blocks import apply, Pivot, times
 
 
@@ -50,7 +51,7 @@ class Tridiagonal(eqx.Module):
 
     def solve(self, r: Float[Array, "b 1"]) -> Float[Array, "b 1"]:
         lower, diagonal, upper = (A[:, 0, 0] for A in self.blocks)
-        return jax.lax.linalg.tridiagonal_solve(lower, diagonal, upper, r)
+        return tridiagonal_solve(lower, diagonal, upper, r)
 
 
 class InOneLoop(eqx.Module):
