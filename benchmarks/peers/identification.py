@@ -2,9 +2,7 @@
 
 `python -m benchmarks.peers.identification --json FILE --plot FILE`
 
-All get the same data, unknowns and guess, 10 to 20 % off, and run on one core: on two, the derivatives
-of ten unknowns through constraints as many as these can stop for ever in JAX's batched LAPACK
-calls. Needs `pip install "mujoco[sysid]"` for its rows; steps of 1 and 0.25 ms, other settings as in
+All get the same data, unknowns and guess, 10 to 20 % off, and run on one core. Needs `pip install "mujoco[sysid]"` for its rows; steps of 1 and 0.25 ms, other settings as in
 `mechanisms_mujoco`. Coverage is of further draws of the noise, with fits that begin at the first one's result.
 """
 

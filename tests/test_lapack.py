@@ -1,0 +1,92 @@
+"""Batches of LAPACK's routines: the same as one by one, and never as calls that could wait for each other."""
+
+import re
+
+import diffrax as dfx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.linalg
+
+import manifold_jax as mj
+from manifold_jax._linalg import lapack
+from manifold_jax._linalg.dense import factorize, factorize_positive, pseudo_invert
+from manifold_jax._linalg.pivoted import factorize_equilibrated, factorize_pivoted
+
+
+random = np.random.default_rng(0)
+N = 11  # beyond what is eliminated without the library
+MATRICES = random.normal(size=(2, 3, N, N))
+POSITIVE = MATRICES @ np.swapaxes(MATRICES, -1, -2) + np.eye(N)
+RIGHT = random.normal(size=(3, N))
+
+
+def batched_calls(program, *args):
+    """Return the shapes of what LAPACK is called with, of calls with more than one matrix."""
+    text = jax.jit(program).lower(*args).as_text()
+    calls = re.findall(r"custom_call @lapack_\w+\(.*?\) .*? : \(tensor<([\dx]+)x[a-z]", text)
+    assert calls
+    shapes = [tuple(map(int, shape.split("x"))) for shape in calls]
+    return [shape for shape in shapes if np.prod(shape[:-2]) > 1]
+
+
+@pytest.mark.parametrize(
+    "factor", [factorize, factorize_positive, factorize_equilibrated, factorize_pivoted]
+)
+def test_batches_of_systems(factor):
+    def solve(A, b):
+        factors = factor(A)
+        return factors.solve(b), factors.factors.solve_transposed(b), factors.usable
+
+    every = jax.vmap(jax.vmap(solve), in_axes=(0, None))
+    x, transposed, usable = jax.jit(every)(POSITIVE, RIGHT)
+    assert usable.all()
+    for i, j in np.ndindex(2, 3):
+        np.testing.assert_allclose(x[i, j], np.linalg.solve(POSITIVE[i, j], RIGHT[j]), rtol=1e-9)
+        expected = np.linalg.solve(POSITIVE[i, j].T, RIGHT[j])
+        np.testing.assert_allclose(transposed[i, j], expected, rtol=1e-9)
+    assert not batched_calls(every, POSITIVE, RIGHT)
+
+
+def test_batches_of_eigenvalues():
+    inverses = jax.vmap(lambda A: pseudo_invert(A).inverse)
+    found = jax.jit(inverses)(POSITIVE[0])
+    np.testing.assert_allclose(found, np.linalg.inv(POSITIVE[0]), rtol=1e-8)
+    assert not batched_calls(inverses, POSITIVE[0])
+    values = jax.vmap(lapack.singular_values)
+    np.testing.assert_allclose(
+        values(MATRICES[0]), np.linalg.svd(MATRICES[0], compute_uv=False), rtol=1e-12
+    )
+    assert not batched_calls(values, MATRICES[0])
+
+
+def test_batches_of_tridiagonal_systems():
+    lower, diagonal, upper = random.normal(size=(3, 4, N)) + np.array([0, 4, 0])[:, None, None]
+    every = jax.vmap(lapack.tridiagonal_solve, in_axes=(0, 0, 0, None))
+    found = every(lower, diagonal, upper, RIGHT.T)
+    for k in range(4):
+        bands = np.stack([np.roll(upper[k], 1), diagonal[k], np.roll(lower[k], -1)])
+        np.testing.assert_allclose(
+            found[k], scipy.linalg.solve_banded((1, 1), bands, RIGHT.T), rtol=1e-10
+        )
+    assert not batched_calls(every, lower, diagonal, upper, RIGHT.T)
+
+
+def test_solves_of_a_mechanism():
+    """25 equations: corrections of all saved values at once, in a batch, with derivatives of several arguments."""
+    problem = mj.problems.delta_robot()
+
+    def ends(change):
+        args = problem.args._replace(platform_mass=problem.args.platform_mass + change[0])
+        args = args._replace(stiffness=args.stiffness + change[1])
+        sol = mj.diffeqsolve(
+            problem.terms,
+            mj.Projected(dfx.Tsit5(), problem.constraint),
+            *(0.0, 0.1, 0.01, problem.y0, args),
+            saveat=dfx.SaveAt(ts=jnp.linspace(0.0, 0.1, 5)),
+            adjoint=dfx.ForwardMode(),
+        )
+        return sol.ys
+
+    assert not batched_calls(jax.vmap(jax.jacfwd(ends)), jnp.zeros((3, 2)))
