@@ -3,7 +3,8 @@
 `python -m benchmarks.peers.identification --json FILE --plot FILE`
 
 All get the same data, unknowns and guess, 10 to 20 % off, and run on one core. Needs `pip install
-"mujoco[sysid]"` for its rows; steps of 1 and 0.25 ms, other settings as in `mechanisms_mujoco`. Coverage is of further draws of the noise, with fits that begin at the first one's result.
+"mujoco[sysid]"` for its rows; steps of 1 and 0.25 ms, other settings as in `mechanisms_mujoco`. Coverage is of
+further draws of the noise, with fits that begin at the first one's result.
 """
 
 import dataclasses
