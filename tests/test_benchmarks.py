@@ -52,6 +52,7 @@ SMALLEST = {
 # Those that compile or train for minutes whatever their settings: imported, not run.
 TOO_LONG = {
     "benchmarks.dae_board.steps",
+    "benchmarks.dae_board.wheelset_reference",
     "benchmarks.peers.identification",
     "benchmarks.peers.lithium_ion",
     "benchmarks.peers.mechanisms_mujoco",
