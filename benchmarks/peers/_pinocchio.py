@@ -4,6 +4,7 @@ An independent check: the tree has joint coordinates, nothing is welded together
 of hinges without mass stay hinges.
 """
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -97,6 +98,25 @@ class Tree:
         system = np.block([[M, J.T], [J, np.zeros((len(J), len(J)))]])
         right = np.concatenate([-h, *(-part for part in bias)])
         return np.linalg.lstsq(system, right, rcond=1e-12)[0][: model.nv]
+
+    def forward_dynamics(self, q: np.ndarray, v: np.ndarray) -> Callable[[], np.ndarray]:
+        """Return a program for one evaluation by Pinocchio's own solver of closed loops."""
+        pin, model, data = self.pin, self.model, self.data
+        kinds, loops = {6: pin.ContactType.CONTACT_6D, 3: pin.ContactType.CONTACT_3D}, []
+        for first, second, number in self.loops:
+            sides = [model.frames[frame] for frame in (first, second)]
+            ends = [part for side in sides for part in (side.parentJoint, side.placement)]
+            loops.append(
+                pin.RigidConstraintModel(kinds[number], model, *ends, pin.ReferenceFrame.LOCAL)
+            )
+        models, states = pin.StdVec_RigidConstraintModel(), pin.StdVec_RigidConstraintData()
+        models.extend(loops)
+        states.extend(loop.createData() for loop in loops)
+        pin.initConstraintDynamics(model, data, models, states)
+        none = np.zeros(model.nv)
+        # Loops with more equations than needed have a singular system, which is solved in a few rounds.
+        rounds = pin.ProximalSettings(1e-12, 1e-9, 20)
+        return lambda: pin.constraintDynamics(model, data, q, v, none, models, states, rounds)
 
     def _acceleration(self, frame: int) -> np.ndarray:
         aligned = self.pin.LOCAL_WORLD_ALIGNED
