@@ -13,7 +13,6 @@ import numpy as np
 import manifold_jax as mj
 
 
-mb = mj.multibody
 SECONDS = 0.2
 SHIFT = 2e-3  # of the number itself, for differences
 CLOSED = 1e-9  # m
@@ -21,21 +20,22 @@ CLOSED = 1e-9  # m
 
 @dataclasses.dataclass(frozen=True)
 class Gradient:
-    """Derivatives by a length, a mass and the damping of a motor, largest relative difference between these
-    and central differences in forward and in reverse mode, and seconds: to compile, and of the run."""
+    """Derivatives by a length, a mass and the damping of a motor; in forward and in reverse mode the largest
+    relative difference of these from central differences, and seconds to compile and of the run."""
 
     steps: int
     derivatives: tuple[float, ...]
     forward: float
-    reverse: float | None
-    forward_first_s: float
+    forward_compile_s: float
     forward_s: float
-    reverse_first_s: float | None
+    reverse: float | None
+    reverse_compile_s: float | None
     reverse_s: float | None
 
 
-def measure(machine: Any, steps: int, reverse: bool = True) -> Gradient:
-    """`machine` has dampers in its motors; so many equal steps."""
+def measure(machine: Any, steps: int, by_reverse: bool) -> Gradient:
+    """Differentiate the sum of squares of how far the bodies of `machine` are from its drawing at the end of so
+    many equal steps. It has dampers in its motors."""
     place = _length(machine)
     numbers = jnp.stack([leaf[at] for leaf, at in zip(_leaves(machine), place, strict=True)])
 
@@ -52,30 +52,32 @@ def measure(machine: Any, steps: int, reverse: bool = True) -> Gradient:
             adjoint=adjoint,
             max_steps=steps + 2,
         )
-        return jnp.sum(sol.ys[0].position ** 2)
+        moved = sol.ys[0].position[-1] - machine.bodies.drawing.position
+        return jnp.sum(moved**2)
 
-    program = jax.jit(lambda x: end(x, dfx.ForwardMode()))
-    forwards = jax.jit(jax.jacfwd(lambda x: end(x, dfx.ForwardMode())))
-    expected = _differences(lambda x: float(program(x)), np.asarray(numbers))
-    found, *times = _timed(forwards, numbers)
-    off = lambda found: float(np.max(np.abs(found / expected - 1)))
-    backwards, of_reverse = None, [None, None]
-    if reverse:
-        adjoint = dfx.RecursiveCheckpointAdjoint()
-        backwards, *of_reverse = _timed(jax.jit(jax.grad(lambda x: end(x, adjoint))), numbers)
-    return Gradient(
-        steps,
-        tuple(found.tolist()),
-        off(found),
-        None if backwards is None else off(backwards),
-        *times,
-        *of_reverse,
-    )
+    def forward(numbers: Any) -> Any:
+        along = lambda x: (end(x, dfx.ForwardMode()),) * 2
+        return jax.jacfwd(along, has_aux=True)(numbers)
+
+    def reverse(numbers: Any) -> Any:
+        return jax.grad(lambda x: end(x, dfx.RecursiveCheckpointAdjoint()))(numbers), None
+
+    program, compiling = _compiled(forward, numbers)
+    (found, _), running = _timed(program, numbers)
+    expected = _differences(lambda x: float(program(jnp.asarray(x))[1]), np.asarray(numbers))
+    off = lambda found: float(np.max(np.abs(np.asarray(found) / expected - 1)))
+    backwards: list[float | None] = [None, None, None]
+    if by_reverse:
+        program, reverse_compiling = _compiled(reverse, numbers)
+        (other, _), reverse_running = _timed(program, numbers)
+        backwards = [off(other), reverse_compiling, reverse_running]
+    derivatives = tuple(np.asarray(found).tolist())
+    return Gradient(steps, derivatives, off(found), compiling, running, *backwards)
 
 
 def _leaves(machine: Any) -> tuple[Any, ...]:
-    """Points of hinges, masses, and dampings of motors."""
-    hinges = next(group for group in machine.joints if group.kind is mb.Revolute)
+    """Points of the most frequent kind of joint, masses, and dampings of motors."""
+    hinges = max(machine.joints, key=lambda group: len(group.attachment.names))
     motors = next(load for load in machine.loads if hasattr(load, "hinge"))
     return hinges.attachment.points, machine.bodies.mass, motors.laws.damping
 
@@ -86,7 +88,7 @@ def _changed(machine: Any, place: Any, numbers: Any) -> Any:
 
 
 def _length(machine: Any) -> tuple[Any, ...]:
-    """Return the places of the longest arm of a hinge with which loops can still be closed where all equations
+    """Return the places of the longest arm of such a joint with which loops can still be closed where all equations
     are counted, of the heaviest body, and of the first motor."""
     points, masses, _ = map(np.asarray, _leaves(machine))
     rest = (int(np.argmax(masses)),), (0,)
@@ -115,11 +117,13 @@ def _differences(f: Any, numbers: np.ndarray) -> np.ndarray:
     return np.array(found)
 
 
-def _timed(program: Any, numbers: Any) -> tuple[Any, float, float]:
-    """Return the result, and seconds of the first and of the second call."""
-    times, found = [], None
-    for _ in range(2):
-        begin = time.perf_counter()
-        found = np.asarray(jax.block_until_ready(program(numbers)))
-        times.append(time.perf_counter() - begin)
-    return found, times[0], times[1]
+def _compiled(function: Any, numbers: Any) -> tuple[Any, float]:
+    begin = time.perf_counter()
+    program = jax.jit(function).lower(numbers).compile()
+    return program, time.perf_counter() - begin
+
+
+def _timed(program: Any, numbers: Any) -> tuple[Any, float]:
+    begin = time.perf_counter()
+    found = jax.block_until_ready(program(numbers))
+    return found, time.perf_counter() - begin

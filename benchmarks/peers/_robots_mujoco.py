@@ -135,6 +135,7 @@ class Soft:
             name1=first,
             name2=second,
             solimp=[0.9999, 0.9999, 0.001, 0.5, 2],
+            data=[0] * 10 + [1, 0],  # at the origins of the frames, whose default is elsewhere
         )
         return first, second
 
@@ -144,6 +145,7 @@ class Soft:
         option.integrator = flags.mjtIntegrator.mjINT_RK4
         option.solver, option.iterations = flags.mjtSolver.mjSOL_NEWTON, 100
         option.tolerance, option.gravity = 1e-14, [0, 0, -9.81]
+        option.jacobian = flags.mjtJacobian.mjJAC_DENSE  # for `efc_J` as a matrix
         option.enableflags |= int(flags.mjtEnableBit.mjENBL_ENERGY)
         option.disableflags |= int(flags.mjtDisableBit.mjDSBL_AUTORESET)
 
