@@ -54,7 +54,8 @@ BY_REVERSE = ("5bar_linkage_iso6d", "talos_like")  # compiles for twice as long
 SECONDS = 10.0
 # In relation to the weight of the robot and 1 m; the cranks of Battobot's feet are light.
 STIFFNESS, SOFTER = 20.0, {"battobot_6d": 1.0}
-DAMPING = 0.01  # s, in relation to the stiffness; less where it is softer, for explicit steps of equal size
+# s, in relation to the stiffness; less where cranks are light, for explicit steps of equal size.
+DAMPING, LESS = 1e-2, {"battobot_6d": 5e-4, "disney_like": 1e-3}
 MAX_STEPS = 200_000
 
 
@@ -132,7 +133,7 @@ def measure(folder: Path, name: str, seconds: float) -> Row:
     machine = sprung(0.0)
     swung = swing(machine, seconds)
     steps = round(2 * gradients.SECONDS * swung["steps"] / seconds)
-    damped = sprung(DAMPING * stiffness * SOFTER.get(name, STIFFNESS) / STIFFNESS)
+    damped = sprung(LESS.get(name, DAMPING) * stiffness)
     return Row(
         robot=name,
         seconds=seconds,
