@@ -55,7 +55,8 @@ SECONDS = 10.0
 # In relation to the weight of the robot and 1 m; the cranks of Battobot's feet are light.
 STIFFNESS, SOFTER = 20.0, {"battobot_6d": 1.0}
 # s, in relation to the stiffness; less where cranks are light, for explicit steps of equal size.
-DAMPING, LESS = 1e-2, {"battobot_6d": 5e-4, "disney_like": 1e-3}
+DAMPING = 1e-2
+LESS = {"battobot_6d": 5e-4, "disney_like": 1e-3, "digit_like": 1e-3, "robot_delta": 1e-3}
 MAX_STEPS = 200_000
 
 
