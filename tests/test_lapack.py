@@ -51,6 +51,29 @@ def test_batches_of_systems(factor):
     assert not batched_calls(every, POSITIVE, RIGHT)
 
 
+@pytest.mark.parametrize("factor", [factorize, factorize_pivoted])
+def test_many_right_hand_sides_of_one_matrix(factor):
+    """They are solved for at once, also within a batch of matrices: no loop over them, no copies of the factors."""
+
+    def solve(A, right):
+        factors = factor(A)
+        transposed = jax.vmap(factors.factors.solve_transposed)(right)
+        return jax.vmap(factors.solve)(right), transposed
+
+    right = random.normal(size=(3, N))
+    x, transposed = jax.jit(solve)(POSITIVE[0, 0], right)
+    np.testing.assert_allclose(x, np.linalg.solve(POSITIVE[0, 0], right.T).T, rtol=1e-9)
+    expected = np.linalg.solve(POSITIVE[0, 0].T, right.T).T
+    np.testing.assert_allclose(transposed, expected, rtol=1e-9)
+    one = lambda b: factor(jnp.asarray(POSITIVE[0, 0])).solve(b)
+    loops = lambda program, b: jax.jit(program).lower(b).as_text().count("stablehlo.while")
+    assert loops(jax.vmap(one), right) == loops(one, right[0])
+    assert not batched_calls(solve, POSITIVE[0, 0], right)
+    every = jax.vmap(solve, in_axes=(0, None))
+    np.testing.assert_allclose(jax.jit(every)(POSITIVE[0], right)[0][0], x, rtol=1e-12)
+    assert not batched_calls(every, POSITIVE[0], right)
+
+
 def test_batches_of_eigenvalues():
     inverses = jax.vmap(lambda A: pseudo_invert(A).inverse)
     found = jax.jit(inverses)(POSITIVE[0])

@@ -116,8 +116,7 @@ def factorize(A: Float[Array, "m m"]) -> Factorization:
     """
     m, fixed = A.shape[0], jax.lax.stop_gradient(A)
     if m > UNROLL_LIMIT:
-        pivots = jnp.diagonal(lapack.lu_factor(_equilibrated(A))[0])
-        return _factorize_by_library(A, jnp.all(jnp.abs(pivots) > rank_threshold(A)))
+        return _by_library(A, *_lu_of_full_rank(fixed))
     return Factorization(A, *eliminate(fixed), _product)
 
 
@@ -163,20 +162,36 @@ def factorize_positive(A: Float[Array, "m m"]) -> Factorization:
     """Factor a symmetric matrix; its rank counts as full if it is positive definite."""
     if A.shape[0] <= UNROLL_LIMIT:
         return factorize(A)  # requires positive pivots, too
+    return _by_library(A, *_lu_of_positive(jax.lax.stop_gradient(A)))
+
+
+@lapack.one_after_the_other
+def _lu_of_full_rank(A: Float[Array, "m m"]) -> tuple[tuple[Array, Array], BoolScalar]:
+    pivots = jnp.diagonal(lapack.lu_factor(_equilibrated(A))[0])
+    full_rank = jnp.all(jnp.abs(pivots) > rank_threshold(A))
+    return lapack.lu_factor(_or_identity(A, full_rank)), full_rank
+
+
+@lapack.one_after_the_other
+def _lu_of_positive(A: Float[Array, "m m"]) -> tuple[tuple[Array, Array], BoolScalar]:
     lower = lapack.cholesky(_equilibrated(A))
     positive = jnp.all(jnp.diagonal(lower) ** 2 > rank_threshold(A))  # NaN unless positive definite
-    return _factorize_by_library(A, positive)
+    return lapack.lu_factor(_or_identity(A, positive)), positive
 
 
 def _equilibrated(A: Float[Array, "m m"]) -> Float[Array, "m m"]:
     size = jnp.sqrt(jnp.maximum(jnp.abs(jnp.diagonal(A)), jnp.finfo(A.dtype).tiny))
-    return jax.lax.stop_gradient(A / size[:, None] / size[None, :])
+    return A / size[:, None] / size[None, :]
 
 
-def _factorize_by_library(A: Float[Array, "m m"], full_rank: BoolScalar) -> Factorization:
-    A = jnp.where(full_rank, A, jnp.eye(A.shape[0], dtype=A.dtype))
-    factors = Library(lapack.lu_factor(jax.lax.stop_gradient(A)))
-    return Factorization(A, factors, full_rank, _product)
+def _or_identity(A: Float[Array, "m m"], usable: BoolScalar) -> Float[Array, "m m"]:
+    return jnp.where(usable, A, jnp.eye(A.shape[0], dtype=A.dtype))
+
+
+def _by_library(
+    A: Float[Array, "m m"], lu: tuple[Array, Array], usable: BoolScalar
+) -> Factorization:
+    return Factorization(_or_identity(A, usable), Library(lu), usable, _product)
 
 
 def gram(A: Float[Array, "i n"], B: Float[Array, "k n"]) -> Float[Array, "i k"]:

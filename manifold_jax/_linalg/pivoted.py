@@ -58,11 +58,13 @@ def factorize_pivoted(
 
 
 def _lapack(A: Inexact[Array, "n n"]) -> tuple[Library, BoolScalar]:
-    lu, pivots = lapack.lu_factor(A)
+    lu, permutation = lapack.lu_factor(A)
     nonsingular = jnp.all(jnp.isfinite(lu)) & jnp.all(jnp.diagonal(lu) != 0)
     lu = jnp.where(nonsingular, lu, jnp.eye(A.shape[0], dtype=A.dtype))
-    pivots = jnp.where(nonsingular, pivots, jnp.arange(A.shape[0], dtype=pivots.dtype))
-    return Library((lu, pivots)), nonsingular
+    permutation = jnp.where(
+        nonsingular, permutation, jnp.arange(A.shape[0], dtype=permutation.dtype)
+    )
+    return Library((lu, permutation)), nonsingular
 
 
 def _eliminate(A: Inexact[Array, "n n"]) -> tuple[UnrolledElimination, BoolScalar]:
