@@ -15,15 +15,8 @@ import numpy as np
 
 
 STEPS = (1e-3, 1e-4)  # s
-SOFTNESS = (
-    2,
-    3,
-    5,
-    10,
-    20,
-    50,
-    100,
-)  # time constants of the loops in steps; 2 is the least MuJoCo allows
+# Time constants of the loops in steps; 2 is the least that MuJoCo allows.
+SOFTNESS = (2, 3, 5, 10, 20, 50, 100)
 
 
 @dataclasses.dataclass(frozen=True)
