@@ -38,12 +38,13 @@ SMALLEST = {
     "benchmarks.peers.polymer": dict(bonds=6, long=1.0, repeats=1, quick=True),
     "benchmarks.sbml_events.__main__": dict(numbers="00929"),
     "benchmarks.speed.accelerator": dict(
-        sizes="4", lanes=2, repeats=1, problems="lorenz", precisions="double"
+        sizes="4", lanes="2,4", repeats=1, problems="lorenz", precisions="double"
     ),
     "benchmarks.speed.closed_forms": dict(repeats=1),
     "benchmarks.speed.compile_profile": dict(problem="pendulum", plain=True),
     "benchmarks.speed.compile_time": dict(compilations=1, repeats=1, only="pendulum"),
     "benchmarks.speed.devices": dict(size=4, repeats=1),
+    "benchmarks.speed.devices_agree": dict(size=2, cases="matrices;pendulum"),
     "benchmarks.speed.ensemble": dict(
         size=4, lanes=2, repeats=1, problems="pendulum", saved=2, pendulums=4
     ),

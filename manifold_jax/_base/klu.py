@@ -10,12 +10,14 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from .device import platform
+
 
 def has_klu(dtype: Any) -> bool:
     """Whether systems of these numbers can be solved by KLU: on CPUs, in double precision."""
     return (
         importlib.util.find_spec("klujax") is not None
-        and jax.default_backend() == "cpu"
+        and platform() == "cpu"
         and jnp.dtype(dtype) == jnp.float64
     )
 

@@ -4,10 +4,10 @@ import functools
 import math
 from typing import Any
 
-import jax
 import numpy as np
 from jax import lax
 
+from .._base import device
 from .lane_arithmetic import apply
 from .lane_arrays import Lanes, NotScalarError
 from .lane_value import LaneValue, object_array
@@ -36,7 +36,7 @@ def iota(lanes: Lanes, equation: Any, values: list[LaneValue]) -> list[LaneValue
 def platform(lanes: Lanes, equation: Any, values: list[LaneValue]) -> list[LaneValue]:
     """Choose the implementation for the device among several."""
     for i, names in enumerate(equation.params["platforms"]):
-        if names is None or jax.default_backend() in names:
+        if names is None or device.platform() in names:
             return [LaneValue.of_constant(np.int32(i))]
     raise NotScalarError("there is no implementation for this device")
 

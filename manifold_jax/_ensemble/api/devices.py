@@ -12,9 +12,15 @@ import jax.tree_util as jtu
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array
 
+from ..._base.device import platform
 from ..lanes.arguments import Axes
 from ..lanes.parts import Inputs
 from ..lanes.solution import EnsembleSolution
+
+
+def default_lanes(mesh: Mesh | None) -> int:
+    """As many as a CPU's caches hold the states of, and as keep the units of other devices busy."""
+    return 128 if platform(mesh) == "cpu" else 262_144
 
 
 def check_mesh(mesh: Any, solver: dfx.AbstractSolver) -> None:

@@ -37,10 +37,7 @@ from ..lanes.execution import solve_on_one_device
 from ..lanes.parts import Inputs
 from ..lanes.solution import EnsembleSolution, messages_of
 from ..lanes.trajectory import LaneEquations
-from .devices import check_mesh, over_devices
-
-
-DEFAULT_LANES = 128
+from .devices import check_mesh, default_lanes, over_devices
 
 
 @refuse_old_names(in_axes="args_axes")
@@ -64,7 +61,7 @@ def solve_ensemble(
     resets: Any = (),
     max_resets: int = 100,
     args_axes: Any = None,
-    lanes: int = DEFAULT_LANES,
+    lanes: int | None = None,
     adjoint: dfx.AbstractAdjoint = StepReplayAdjoint(),
     mesh: Mesh | None = None,
     throw: bool = False,
@@ -88,7 +85,7 @@ def solve_ensemble(
     - `saveat`: the end, `SaveAt(t1=True)`, the start, times (common to all), and functions of them.
     - `event`, `resets`, `max_resets`: as of [`diffeqsolve`][], for each trajectory on its own. What differs
         between trajectories, such as `mj.ResetAt(lambda args: args["doses"], jump)`, is in `args`.
-    - `lanes`: how many trajectories advance together, on each device.
+    - `lanes`: how many trajectories advance together, on each device; by default 128 on a CPU, 262144 on others.
     - `adjoint`: the mode of differentiation: reverse, or `diffrax.ForwardMode()` for `jax.jvp` and
         `jax.jacfwd`. Both make the steps again that the solve made.
     - `mesh`: a `jax.sharding.Mesh`, e.g. `jax.make_mesh((jax.device_count(),), ("trajectories",))`: each of
@@ -118,6 +115,7 @@ def solve_ensemble(
     """
     if mesh is not None:
         check_mesh(mesh, solver)
+    lanes = default_lanes(mesh) if lanes is None else lanes
     check_arguments(terms, solver, dt0, saveat, stepsize_controller, adjoint, event, consistent)
     check_resets(resets, max_resets, None)
     batch = checked_batch(t0, t1, dt0, y0s, args, args_axes, saveat, lanes)

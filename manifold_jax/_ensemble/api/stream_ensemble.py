@@ -30,10 +30,11 @@ from ..stored.arrays import (
 from ..stored.faults import faults_of_chunks, faults_of_descriptions, finished_chunks
 from ..stored.lock import LOCK_FILE, only_writer
 from ..stored.store import stored_at, StoredEnsemble
+from .devices import default_lanes
 from .progress import ChunkMeter
 from .sampling import drawn
 from .settings import check_settings, settings_of
-from .solve_ensemble import DEFAULT_LANES, solve_ensemble
+from .solve_ensemble import solve_ensemble
 
 
 # Indices of trajectories are 32-bit integers unless JAX has 64 bits enabled.
@@ -58,7 +59,7 @@ def stream_ensemble(
     event: dfx.Event | None = None,
     resets: Any = (),
     max_resets: int = 100,
-    lanes: int = DEFAULT_LANES,
+    lanes: int | None = None,
     consistent: Consistent = "project",
     chunk: int = 8192,
     seed: int = 0,
@@ -131,7 +132,7 @@ def stream_ensemble(
         "saveat": saveat,
         "stepsize_controller": stepsize_controller,
         "max_steps": max_steps,
-        "lanes": lanes,
+        "lanes": default_lanes(None) if lanes is None else lanes,
         "consistent": consistent,
     }
     if event is not None:

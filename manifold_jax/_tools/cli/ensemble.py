@@ -6,7 +6,6 @@ from typing import Annotated, Any, TYPE_CHECKING
 
 import typer
 
-from ..._ensemble.api.solve_ensemble import DEFAULT_LANES
 from . import options
 from .arguments import task_for
 from .commands import app
@@ -39,8 +38,12 @@ def ensemble(
     t1: options.EndTime = None,
     seed: Annotated[int, typer.Option(help="Seed of the random numbers.")] = 0,
     lanes: Annotated[
-        int, typer.Option(min=1, help="How many trajectories advance together.")
-    ] = DEFAULT_LANES,
+        int | None,
+        typer.Option(
+            min=1,
+            help="How many trajectories advance together; by default 128 on a CPU, 262144 elsewhere.",
+        ),
+    ] = None,
     chunk: Annotated[
         int, typer.Option(min=1, help="How many are solved and written together.")
     ] = 8192,
