@@ -14,6 +14,7 @@ from ._multibody import (
     Force as Force,
     from_mujoco as from_mujoco,
     GROUND as GROUND,
+    JointCoordinates as JointCoordinates,
     JointSpring as JointSpring,
     LinearActuator as LinearActuator,
     Motor as Motor,

@@ -13,6 +13,7 @@ from .forces import (
     Spring as Spring,
     Torque as Torque,
 )
+from .joint_coordinates import JointCoordinates as JointCoordinates
 from .joints import (
     AbstractJoint as AbstractJoint,
     Cylindrical as Cylindrical,

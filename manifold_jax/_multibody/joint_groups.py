@@ -131,18 +131,18 @@ def _drawn_lengths(attachment: Attachment, drawing: Pose) -> Float[Array, " k"]:
 
 def residuals(groups: tuple[JointGroup, ...], q: Pose) -> tuple[Float[Array, "k r"], ...]:
     """Return the residuals of all joints, kind by kind."""
-    return _residuals(groups, with_ground(q.coordinates)[_index(groups)])
+    return residuals_of(groups, Placed.of(with_ground(q.coordinates)[bodies_of(groups)]))
 
 
 def jacobian(groups: tuple[JointGroup, ...], q: Pose) -> Float[Array, "r n c"]:
     """Return the derivatives of all equations of joints with respect to the coordinates of the bodies.
     Each joint depends on two: one derivative for each of their coordinates, for all joints at once."""
-    index, rows = _index(groups), with_ground(q.coordinates)
+    index, rows = bodies_of(groups), with_ground(q.coordinates)
     number, size = rows.shape
     if not groups:
         return jnp.zeros((0, number - 1, size), rows.dtype)
     here = rows[index]
-    moved = lambda here: _residuals(groups, here)
+    moved = lambda here: residuals_of(groups, Placed.of(here))
     along = lambda seed: jax.jvp(moved, (here,), (jnp.broadcast_to(seed[:, None, :], here.shape),))[
         1
     ]
@@ -158,9 +158,8 @@ def jacobian(groups: tuple[JointGroup, ...], q: Pose) -> Float[Array, "r n c"]:
     return whole[:, :-1]
 
 
-def _residuals(groups: tuple[JointGroup, ...], here: Float[Array, "2 k c"]) -> Any:
-    """Compute the residuals from the coordinates of the bodies of all joints."""
-    placed = Placed.of(here)
+def residuals_of(groups: tuple[JointGroup, ...], placed: Placed) -> tuple[Float[Array, "k r"], ...]:
+    """Return the residuals from the frames of the first and second bodies of all joints, `(2, K, ...)`."""
     found, start = [], 0
     for group in groups:
         own = slice(start, start := start + len(group.attachment.names))
@@ -169,7 +168,7 @@ def _residuals(groups: tuple[JointGroup, ...], here: Float[Array, "2 k c"]) -> A
     return tuple(found)
 
 
-def _index(groups: tuple[JointGroup, ...]) -> np.ndarray:
+def bodies_of(groups: tuple[JointGroup, ...]) -> np.ndarray:
     """Return the first and second bodies of all joints, shape `(2, K)`."""
     none = np.zeros((2, 0), int)
     return np.concatenate([none, *(group.attachment.index for group in groups)], axis=1)

@@ -54,6 +54,36 @@ def quaternion_rate(p: Float[Array, "*n 4"], spin: Float[Array, "*n 3"]) -> Floa
     return turn_back(rates_matrix(p), turn_back(rotation_matrix(p), spin)) / 2
 
 
+def about(axis: Float[Array, "*n 3"], angle: Float[Array, "*n"]) -> Float[Array, "*n 3 3"]:
+    """Return the turns about unit vectors, `1 + sin(angle) K + (1 - cos(angle)) K^2` with `K x = axis cross x`."""
+    axes, identity = (
+        jnp.broadcast_to(axis[..., None, :], (*axis.shape, 3)),
+        np.eye(3, dtype=axis.dtype),
+    )
+    across = jnp.swapaxes(jnp.cross(axes, jnp.broadcast_to(identity, axes.shape)), -1, -2)
+    along = axis[..., :, None] * axis[..., None, :]
+    c, s = jnp.cos(angle)[..., None, None], jnp.sin(angle)[..., None, None]
+    return c * identity + s * across + (1 - c) * along
+
+
+def multiply_quaternions(p: Float[Array, "*n 4"], r: Float[Array, "*n 4"]) -> Float[Array, "*n 4"]:
+    """Return the quaternions of the turns `R(p) R(r)`."""
+    a, b, c, d = p[..., 0], p[..., 1], p[..., 2], p[..., 3]
+    rows = [[a, -b, -c, -d], [b, a, -d, c], [c, d, a, -b], [d, -c, b, a]]
+    return turn(jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2), r)
+
+
+def conjugate(p: Float[Array, "*n 4"]) -> Float[Array, "*n 4"]:
+    """Return the quaternions of the turns back."""
+    return p * np.array([1.0, -1.0, -1.0, -1.0], p.dtype)
+
+
+def quaternion_about(axis: Float[Array, "*n 3"], angle: Float[Array, "*n"]) -> Float[Array, "*n 4"]:
+    """Return the quaternions of turns about unit vectors."""
+    half = angle[..., None] / 2
+    return jnp.concatenate([jnp.cos(half), jnp.sin(half) * axis], axis=-1)
+
+
 def planar_rotation(angle: Float[Array, "*n"]) -> Float[Array, "*n 3 3"]:
     """Return the turn by an angle about the third axis."""
     c, s, zero, one = jnp.cos(angle), jnp.sin(angle), jnp.zeros_like(angle), jnp.ones_like(angle)

@@ -1,0 +1,200 @@
+"""An assembly in the coordinates of its joints."""
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+import scipy.linalg
+from jaxtyping import Array, Float
+
+from .._base.types import Args, RealScalarLike
+from .._linalg.dense import factorize_positive
+from .._mechanics import MechanicalConstraint, MechanicalSystem
+from .assembly import Assembly
+from .bodies import Pose
+from .checks import is_concrete
+from .spanning_tree import find_spanning_tree, SpanningTree
+from .start import CLOSED
+from .system import ConstantAssembly
+from .tree_motion import TreeMotion
+from .tree_readings import coordinates_of, poses_of
+from .tree_system import LoopEquations, Loops, motion_of, TreeForces, TreeMass
+
+
+_DEPENDENT = 1e-9
+State = tuple[Float[Array, "*t n"], Float[Array, "*t n"]]
+
+
+class JointCoordinates(eqx.Module):
+    r"""An [`Assembly`][] in the coordinates of its joints, a spanning tree of them, with the other joints as
+    constraints:
+
+        M(q) a + J^T lambda = Q(t, q, v),   phi(t, q) = 0.
+
+    ```python
+    robot = mb.read_urdf("robot.urdf", closures="robot.yaml").assembly
+    joints = mb.JointCoordinates(robot)
+    hook = mj.Projected(dfx.Dopri8(), joints.constraint)
+    sol = mj.diffeqsolve(joints.terms, hook, 0.0, 1.0, 0.01, joints.state(), ...)
+    robot.gaps(joints.poses(sol.ys)[0])  # also motion, point, energy, draw, animate
+    ```
+
+    `q` has far fewer numbers than the poses of all bodies, and the joints of the tree hold by construction: a robot
+    of ten bodies in one loop is solved several times as fast. Prefer the assembly itself for long chains
+    (`M` is a full matrix: costs grow with the cube of the number of coordinates), and for the forces in the joints.
+
+    **Arguments:**
+
+    - `assembly`: where some equations of its joints depend on others, one of
+        `without_dependent_equations`, or with `redundant=True`.
+
+    **Attributes:**
+
+    - `names`: of the numbers of `q`: angles of hinges (rad) and displacements of sliders (m), zero in the
+        drawing, by the names of their joints; several numbers of one joint are `"name[0]"`, `"name[1]"`. A
+        universal joint has two angles, a cylindrical one an angle and a displacement, a ball joint a
+        unit quaternion, by which the second body is turned from where it is drawn, in the frame of the
+        first. Bodies that no joints but rods tie to the ground have the coordinates of a `Pose`.
+    - `terms`, `constraint`: the vector field on `(q, v)` with `v = dq/dt`, and the manifold; `None` if all joints are
+        part of the tree, which is then solved by any solver alone.
+    - `system`: both as a [`MechanicalSystem`][manifold_jax.MechanicalSystem].
+
+    The tree is the one with the fewest coordinates. To differentiate by numbers of the assembly, replace it inside
+    your function: `eqx.tree_at(lambda joints: joints.assembly, joints, changed)`.
+
+    Source: Featherstone, Rigid Body Dynamics Algorithms (2008), ch. 8.
+    """
+
+    assembly: Assembly
+    tree: SpanningTree = eqx.field(static=True)
+    independent: tuple[int, ...] | None = eqx.field(static=True)
+
+    def __init__(self, assembly: Assembly):
+        if not isinstance(assembly, Assembly):
+            raise TypeError(
+                f"`assembly` must be an `mj.multibody.Assembly`, got {type(assembly).__name__}. Of a robot take `robot.assembly`."
+            )
+        self.assembly = assembly
+        self.tree = find_spanning_tree(assembly.joints, len(assembly.names))
+        self.independent = None if assembly.independent is None else self._find_independent()
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(column.name for column in self._motion.coordinates.columns)
+
+    @property
+    def system(self) -> MechanicalSystem:
+        if not self._has_constraints:
+            raise ValueError(
+                "All joints are part of the tree: there are no constraints. Use `terms` and the solver alone."
+            )
+        source = ConstantAssembly(self.assembly)
+        equations = LoopEquations(source, self.tree, self.independent)
+        mass, forces = TreeMass(source, self.tree), TreeForces(source, self.tree)
+        redundant = self.assembly.redundant and self.independent is None
+        return MechanicalSystem(mass, equations, forces, redundant=redundant, structure="dense")
+
+    @property
+    def terms(self) -> dfx.AbstractTerm:
+        return self.system.terms if self._has_constraints else dfx.ODETerm(self._field)
+
+    @property
+    def constraint(self) -> MechanicalConstraint | None:
+        return self.system.constraint if self._has_constraints else None  # pyright: ignore[reportReturnType]
+
+    def state(self, y: tuple[Pose, Pose] | None = None) -> State:
+        """Return the state `(q, v)` of a state of the assembly, by default `assembly.state()`, the drawing at
+        rest. Angles are from `-pi` to `pi`.
+
+        **Raises** `ValueError` if the state does not satisfy the joints of the tree.
+        """
+        y = self.assembly.state() if y is None else y
+        found = _coordinates_of(self._motion, y)
+        if all(map(is_concrete, jtu.tree_leaves((self.assembly, y)))):
+            self._check(found, y)
+        return found
+
+    def poses(self, y: State) -> tuple[Pose, Pose]:
+        """Return the state of the assembly; `y` may have leading axes, such as `sol.ys`."""
+        if y[0].ndim > 1:
+            return jax.vmap(self.poses)(y)
+        return poses_of(self._motion, *y)
+
+    @property
+    def _motion(self) -> TreeMotion:
+        return motion_of(self.assembly, self.tree)
+
+    @property
+    def _has_constraints(self) -> bool:
+        return any(self.tree.loops) or self._motion.coordinates.has("quaternion")
+
+    def _field(self, t: RealScalarLike, y: State, args: Args) -> State:
+        source = ConstantAssembly(self.assembly)
+        mass = factorize_positive(TreeMass(source, self.tree)(y[0], args))
+        a = mass.solve(TreeForces(source, self.tree)(t, *y, args))
+        return y[1], a + jnp.where(mass.usable, 0, jnp.nan).astype(a.dtype)
+
+    def _check(self, found: State, y: tuple[Pose, Pose]) -> None:
+        for what, ours, given in zip(
+            ("positions", "velocities"), self.poses(found), y, strict=True
+        ):
+            gap = np.abs(np.asarray(ours.coordinates) - np.asarray(given.coordinates))
+            if not self.assembly.bodies.planar and what == "positions":
+                other = np.abs(np.asarray(ours.coordinates) + np.asarray(given.coordinates))
+                gap[:, 3:] = np.minimum(gap[:, 3:], other[:, 3:])  # a quaternion and its opposite
+            elif what == "positions":
+                gap[:, 2] = np.abs(np.sin(gap[:, 2] / 2))
+            if not gap.max() <= 10 * CLOSED * max(1, np.abs(given.coordinates).max()):
+                body = self.assembly.names[int(gap.max(axis=1).argmax())]
+                raise ValueError(
+                    f"`y`: the {what} of {body!r} are not those that the joints allow (gap {gap.max():.3g}). Make a state by "
+                    "`assembly.state(..., assemble=True)`."
+                )
+
+    def _find_independent(self) -> tuple[int, ...] | None:
+        """Return the numbers of as many equations of loops as are independent in the drawing, `None` for all. That
+        they are so elsewhere was found by `without_dependent_equations`."""
+        if not all(map(is_concrete, jtu.tree_leaves(self.assembly))):
+            raise ValueError(
+                "`assembly` is one of `without_dependent_equations`, whose numbers must be known: call `JointCoordinates` outside "
+                "of `jit`, `vmap` and derivatives, and replace `assembly` inside, by `eqx.tree_at`."
+            )
+        motion, groups = self._motion, self.assembly.joints
+        q, _ = _coordinates_of(motion, self.assembly.state())
+        passive = tuple(
+            () if group.motions is not None else own
+            for group, own in zip(groups, self.tree.loops, strict=True)
+        )
+        loops = Loops.of(groups, self.tree._replace(loops=passive))
+        J = np.asarray(_of_loops(motion, loops, q))
+        mass = eqx.filter_jit(TreeMass(ConstantAssembly(self.assembly), self.tree))(q, None)
+        sizes, modes = np.linalg.eigh(mass)
+        has_mass = sizes > _DEPENDENT * sizes.max()
+        weighted = J @ (modes[:, has_mass] / np.sqrt(sizes[has_mass]))
+        lengths = np.linalg.norm(weighted, axis=1, keepdims=True)
+        # Equations that hold whatever the coordinates are, such as those across the plane of a linkage, count as zero.
+        has_size = lengths > _DEPENDENT * lengths.max(initial=0)
+        weighted = np.where(has_size, weighted / np.where(has_size, lengths, 1), 0)
+        _, triangle, order = scipy.linalg.qr(weighted.T, mode="economic", pivoting=True)
+        pivots = np.abs(np.diagonal(triangle))
+        number = int(np.sum(pivots > _DEPENDENT * pivots.max(initial=1e-300)))
+        if number == J.shape[0]:
+            return None
+        chosen = np.sort(order[:number])
+        drives = sum(len(group.attachment.names) for group in groups if group.motions is not None)
+        norms = motion.coordinates.quaternions().shape[0]
+        return (*chosen.tolist(), *range(J.shape[0], J.shape[0] + drives + norms))
+
+
+# One program each, not one for each operation.
+_coordinates_of = eqx.filter_jit(coordinates_of)
+_poses = eqx.filter_jit(poses_of)
+
+
+@eqx.filter_jit
+def _of_loops(motion: TreeMotion, loops: Loops, q: Float[Array, " n"]) -> Float[Array, "m n"]:
+    at = motion.place(q)
+    rows = loops.jacobian(at, jnp.concatenate(motion.jacobians(at), axis=2))
+    return jnp.concatenate([jnp.zeros((0, q.size), q.dtype), *rows])
