@@ -56,12 +56,11 @@ def quaternion_rate(p: Float[Array, "*n 4"], spin: Float[Array, "*n 3"]) -> Floa
 
 def about(axis: Float[Array, "*n 3"], angle: Float[Array, "*n"]) -> Float[Array, "*n 3 3"]:
     """Return the turns about unit vectors, `1 + sin(angle) K + (1 - cos(angle)) K^2` with `K x = axis cross x`."""
-    axes, identity = (
-        jnp.broadcast_to(axis[..., None, :], (*axis.shape, 3)),
-        np.eye(3, dtype=axis.dtype),
-    )
-    across = jnp.swapaxes(jnp.cross(axes, jnp.broadcast_to(identity, axes.shape)), -1, -2)
     along = axis[..., :, None] * axis[..., None, :]
+    x, y, z, zero = axis[..., 0], axis[..., 1], axis[..., 2], jnp.zeros_like(angle)
+    rows = [[zero, -z, y], [z, zero, -x], [-y, x, zero]]
+    across = jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
+    identity = jnp.broadcast_to(jnp.eye(3, dtype=axis.dtype), along.shape)
     c, s = jnp.cos(angle)[..., None, None], jnp.sin(angle)[..., None, None]
     return c * identity + s * across + (1 - c) * along
 
@@ -75,7 +74,7 @@ def multiply_quaternions(p: Float[Array, "*n 4"], r: Float[Array, "*n 4"]) -> Fl
 
 def conjugate(p: Float[Array, "*n 4"]) -> Float[Array, "*n 4"]:
     """Return the quaternions of the turns back."""
-    return p * np.array([1.0, -1.0, -1.0, -1.0], p.dtype)
+    return jnp.concatenate([p[..., :1], -p[..., 1:]], axis=-1)
 
 
 def quaternion_about(axis: Float[Array, "*n 3"], angle: Float[Array, "*n"]) -> Float[Array, "*n 4"]:

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .bodies import Bodies
-from .frames import Placed, Vectors, with_ground
+from .frames import Placed, with_ground
 from .joint_groups import JointGroup
 from .rotations import about, compose, length_of, rates_matrix, rotation_matrix, turn, turn_back
 from .spanning_tree import FREE, SpanningTree
@@ -21,10 +21,10 @@ class TreeJoints(NamedTuple):
     first: np.ndarray
     second: np.ndarray
     reversed: np.ndarray  # whether the parent is the second body
-    axis: Vectors  # in the first body
-    second_axis: Vectors  # of universal joints: in the second body
-    at_first: Vectors
-    at_second: Vectors
+    axis: Float[Array, "b 3"]  # in the first body
+    second_axis: Float[Array, "b 3"]  # of universal joints: in the second body
+    at_first: Float[Array, "b 3"]
+    at_second: Float[Array, "b 3"]
     drawn: Float[Array, "b 3 3"]
 
     @staticmethod
@@ -46,10 +46,10 @@ class TreeJoints(NamedTuple):
         first, second = np.where(turned, *ends), np.where(turned, *ends[::-1])
         R = Placed.of(with_ground(bodies.drawing.coordinates)).rotation
         relative = compose(jnp.swapaxes(R[first], 1, 2), R[second])
-        drawn = jnp.where(is_free[:, None, None], jnp.eye(3, dtype=dtype), relative)
+        drawn = jnp.where(is_free[:, None, None], jnp.eye(3, dtype=dtype)[None], relative)
         return TreeJoints(first, second, turned, *axes, *points, drawn)
 
-    def second_axis_drawn(self) -> Vectors:
+    def second_axis_drawn(self) -> Float[Array, "b 3"]:
         """Return the second axes in the first bodies, in the drawing."""
         return turn(self.drawn, self.second_axis)
 
@@ -67,7 +67,7 @@ class TreeJoints(NamedTuple):
 
     def edges(
         self, coordinates: TreeCoordinates, q: Float[Array, " n"], turns: Float[Array, "b 3 3"]
-    ) -> tuple[Float[Array, "b 3 3"], Vectors]:
+    ) -> tuple[Float[Array, "b 3 3"], Float[Array, "b 3"]]:
         """Return rotations and origins of the bodies in the frames of their parents."""
         shift = self.at_first
         if coordinates.has("shift"):
@@ -88,9 +88,9 @@ class TreeJoints(NamedTuple):
         self,
         coordinates: TreeCoordinates,
         q: Float[Array, " n"],
-        R: Float[Array, "n 3 3"],
+        R: Float[Array, "w 3 3"],
         turns: Float[Array, "b 3 3"],
-    ) -> Vectors:
+    ) -> Float[Array, "c 3"]:
         """Return the axes of all coordinates in world coordinates."""
         first, dtype = R[self.first], R.dtype
         kinds = {"angle": turn(first, self.axis)[:, None]}
@@ -98,7 +98,7 @@ class TreeJoints(NamedTuple):
             kinds["second_angle"] = turn(R[self.second], self.second_axis)[:, None]
         if coordinates.has("shift"):
             free = coordinates.is_free[:, None, None]
-            kinds["shift"] = jnp.where(free, jnp.eye(3, dtype=dtype), kinds["angle"])
+            kinds["shift"] = jnp.where(free, jnp.eye(3, dtype=dtype)[None], kinds["angle"])
         if coordinates.has("quaternion"):
             _, quaternion, length = _quaternions(coordinates, jnp.append(q, 0))
             rates = compose(turns, rates_matrix(quaternion)) * (2 / length[:, None, None])

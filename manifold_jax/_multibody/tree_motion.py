@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .bodies import Bodies
-from .frames import Frames, Placed, Vectors
+from .frames import Frames, Placed
 from .joint_groups import JointGroup
 from .rotations import compose, turn
 from .spanning_tree import SpanningTree
@@ -27,8 +27,8 @@ class TreePlacement(NamedTuple):
 
     rotation: Float[Array, "n 3 3"]
     origin: Float[Array, "n 3"]
-    axis: Vectors
-    point: Vectors
+    axis: Float[Array, "c 3"]
+    point: Float[Array, "c 3"]
 
     @property
     def placed(self) -> Placed:
@@ -73,7 +73,7 @@ class TreeMotion(eqx.Module):
 
     def bias(
         self, at: TreePlacement, frames: Frames, v: Float[Array, " n"]
-    ) -> tuple[Vectors, Vectors]:
+    ) -> tuple[Float[Array, "b 3"], Float[Array, "b 3"]]:
         """Return the accelerations of all bodies, and their angular ones, where those of `q` are zero: the
         changes of axes and points, which are fixed in bodies, times the rates. The four axes of a
         quaternion change in its own frame, too, by what adds up to zero for rates that keep its norm."""
@@ -83,7 +83,8 @@ class TreeMotion(eqx.Module):
         point_rate = frames.velocity[of_point] + jnp.cross(
             frames.spin[of_point], at.point - at.origin[of_point]
         )
-        arm, arm_rate = at.origin[:-1, None] - at.point, frames.velocity[:-1, None] - point_rate
+        arm = at.origin[:-1, None] - at.point[None]
+        arm_rate = frames.velocity[:-1, None] - point_rate[None]
         turning = jnp.cross(axis_rate[None], arm) + jnp.cross(at.axis[None], arm_rate)
         rates, along = v[None, :, None], jnp.broadcast_to(axis_rate[None], arm.shape)
         linear = jnp.where(moved, jnp.where(turns, turning, along), 0)
@@ -93,7 +94,7 @@ class TreeMotion(eqx.Module):
     def inertia(self, at: TreePlacement) -> Float[Array, "b 3 3"]:
         """Return the moments of inertia in world coordinates."""
         if self.bodies.planar:
-            return self.bodies.inertia[:, None, None] * np.diag([0.0, 0.0, 1.0])
+            return self.bodies.inertia[:, None, None] * np.diag([0.0, 0.0, 1.0])[None]
         R = at.rotation[:-1]
         return compose(compose(R, self.bodies.inertia), jnp.swapaxes(R, 1, 2))
 
@@ -109,8 +110,8 @@ def _coordinates(*of: Any) -> TreeCoordinates:
 
 
 def _composed(
-    parents: np.ndarray, R: Float[Array, "b 3 3"], origin: Vectors
-) -> tuple[Float[Array, "n 3 3"], Vectors]:
+    parents: np.ndarray, R: Float[Array, "b 3 3"], origin: Float[Array, "b 3"]
+) -> tuple[Float[Array, "n 3 3"], Float[Array, "n 3"]]:
     """Compose the frames of bodies in their parents to those in the world, and append the ground."""
     ground = parents.size - 1
     R = jnp.concatenate([R, jnp.eye(3, dtype=R.dtype)[None]])

@@ -57,7 +57,10 @@ class TreeForces(eqx.Module):
         at = motion.place(q)
         frames = motion.frames(at, v)
         mass, spin = motion.bodies.mass[:, None], frames.spin[:-1]
-        total = jnp.pad(mass * assembly.gravity, ((0, 1), (0, 0))), jnp.zeros_like(frames.origin)
+        total = (
+            jnp.pad(mass * assembly.gravity[None], ((0, 1), (0, 0))),
+            jnp.zeros_like(frames.origin),
+        )
         poses = poses_of(motion, q, v)
         for loads in assembly.loads:
             total = add(total, loads.wrench(t, poses, frames, args))
@@ -108,7 +111,7 @@ class Loops(NamedTuple):
         pairs = zip(groups, tree.loops, strict=True)
         return Loops(tuple(_part(group, np.array(own)) for group, own in pairs if own))
 
-    def residuals(self, at: TreePlacement) -> tuple[Float[Array, "k r"], ...]:
+    def residuals(self, at: TreePlacement) -> tuple[Float[Array, "_ _"], ...]:
         return residuals_of(self.groups, self._placed(at))
 
     def _placed(self, at: TreePlacement) -> Placed:
@@ -117,14 +120,14 @@ class Loops(NamedTuple):
 
     def jacobian(
         self, at: TreePlacement, J: Float[Array, "b n 6"]
-    ) -> tuple[Float[Array, "r n"], ...]:
+    ) -> tuple[Float[Array, "_ n"], ...]:
         """Return the derivatives by `q`: those by motions of the two bodies of each joint, times the
         derivatives `J` of these."""
         if not self.groups:
             return ()
         placed, index = self._placed(at), bodies_of(self.groups)
 
-        def moved(motion: Float[Array, "2 k 6"]) -> tuple[Float[Array, "k r"], ...]:
+        def moved(motion: Float[Array, "2 k 6"]) -> tuple[Float[Array, "_ _"], ...]:
             """Shift and turn the bodies, to first order."""
             shift, angle = motion[..., :3], motion[..., 3:]
             turned = placed.rotation + jnp.cross(angle[..., None], placed.rotation, axis=-2)

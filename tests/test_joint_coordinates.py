@@ -1,0 +1,257 @@
+"""Assemblies in the coordinates of their joints: the same motions as in the poses of all bodies."""
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import multibody_cases as cases
+import numpy as np
+import pytest
+import scipy.linalg
+
+import manifold_jax as mj
+
+
+mb = mj.multibody
+GRAVITY = (0.3, -0.2, -9.81)
+
+
+def body(name, i, at):
+    """A body with moments that differ, turned in the drawing."""
+    turned = mb.quaternion((1.0, 0.3 * i, -0.5), 0.4 + 0.3 * i)
+    inertia = np.diag([0.2, 0.25, 0.3]) + 0.005 * (i + 1) * np.ones((3, 3))
+    return mb.Body(name, 1.0 + 0.3 * i, inertia, position=at, orientation=turned)
+
+
+def every_joint():
+    """Each kind of joint in the tree, some with the parent as the second body, and loops: a rod, a ball joint
+    and a drive; one body moves freely on a spring."""
+    bodies = [
+        body(name, i, np.array([0.5 * i, 0.2 * i, -0.3 * i])) for i, name in enumerate("abcdefghi")
+    ]
+    joints = [
+        mb.Revolute(mb.GROUND, "a", at=(0, 0, 0.2), axis=(0.2, 1, 0.1), name="hinge"),
+        mb.Universal("b", "a", at=(0.3, 0.1, 0), axis=((1, 0, 0.5), (-0.5, 0.2, 1)), name="cardan"),
+        mb.Cylindrical("c", "b", at=(0.8, 0.3, -0.5), axis=(1, 1, 0), name="screw"),
+        mb.Spherical("d", "c", at=(1.2, 0.5, -0.7), name="ball"),
+        mb.Prismatic("e", "d", at=(1.7, 0.7, -1.0), axis=(0, 1, 0.4), name="slider"),
+        mb.Fixed("e", "f", name="weld"),
+        mb.Revolute("g", "b", at=(0.4, 0.4, -0.2), axis=(1, 0, 0.3), name="branch"),
+        mb.Universal("d", "g", at=(1.0, 0.5, 0.1), axis=((1, 0, 0), (0, 0, 1)), name="closing"),
+        mb.Spherical("h", "f", at=(2.8, 1.0, -2.0), name="hand"),
+        mb.Distance("f", mb.GROUND, between=((2.5, 1.0, -1.5), (3.0, 0, 1)), name="rod"),
+        mb.Drive("hinge", lambda t, args: 0.2 * jnp.sin(3 * t), name="drive"),
+    ]
+    forces = [
+        mb.Spring("i", "f", points=((0.1, 0, 0), (0, 0.2, 0)), stiffness=20.0, length=0.5),
+        mb.JointSpring("slider", stiffness=5.0, damping=0.3),
+        mb.Torque("d", (0.1, -0.2, 0.3)),
+        mb.Controller(
+            ("branch",), lambda t, y, args: y[0].position[3, :1] - y[1].orientation[6, 1:2]
+        ),
+    ]
+    return mb.Assembly(bodies, joints, forces, gravity=GRAVITY)
+
+
+def in_the_plane():
+    """A slider-crank whose slider is the first body of its joint, and a body that moves freely on a damper."""
+    bodies = [
+        mb.Body("crank", 1.0, 0.1, position=(0.3, 0.1), orientation=0.4),
+        mb.Body("rod", 0.7, 0.2, position=(1.0, 0.3), orientation=-1.9),
+        mb.Body("slider", 2.0, 0.3, position=(1.7, 0.2), orientation=2.8),
+        mb.Body("weight", 1.5, 0.2, position=(0.0, -1.0), orientation=-0.7),
+    ]
+    joints = [
+        mb.Revolute("crank", mb.GROUND, at=(0, 0)),
+        mb.Revolute("crank", "rod", at=(0.6, 0.2)),
+        mb.Revolute("slider", "rod", at=(1.5, 0.1)),
+        mb.Prismatic("slider", mb.GROUND, at=(1.7, 0.2), axis=(1, 0.2), name="guide"),
+        mb.Distance("weight", "crank", between=((0.1, -0.9), (0.4, 0.0))),
+    ]
+    forces = [mb.Damper("weight", "rod", between=((0.0, -1.0), (1.0, 0.3)), damping=0.4)]
+    return mb.Assembly(bodies, joints, forces, gravity=(0.2, -9.81))
+
+
+MECHANISMS = {"in space": every_joint, "in the plane": in_the_plane}
+
+
+def moving(assembly, seed=0):
+    """The drawing, closed, with random velocities that the joints allow."""
+    random = np.random.default_rng(seed)
+    planar, names = assembly.bodies.planar, assembly.names
+    return assembly.state(
+        velocities={names[-1]: random.normal(size=2 if planar else 3)},
+        angular_velocities={names[-1]: random.normal(size=() if planar else 3)},
+        assemble=True,
+    )
+
+
+def perturbed(joints, y, seed=1):
+    """Another state: positions and velocities moved along the manifold."""
+    random, (q, v) = np.random.default_rng(seed), y
+    J = np.asarray(eqx.filter_jit(joints.system.holonomic.jacobian)(0.0, q, None))
+    free = scipy.linalg.null_space(J)
+    q = q + 0.1 * free @ random.normal(size=free.shape[1])
+    v = v + free @ random.normal(size=free.shape[1])
+    move = lambda y: mj.project(joints.constraint, 0.0, y)[0]
+    return jax.jit(move)((q, v))
+
+
+@pytest.mark.parametrize("case", MECHANISMS)
+def test_accelerations_are_those_in_poses_of_bodies(case):
+    """Also away from the drawing, where every axis has moved."""
+    assembly = MECHANISMS[case]()
+    joints = mb.JointCoordinates(assembly)
+    y = perturbed(joints, joints.state(moving(assembly)))
+    poses = joints.poses(y)
+    assert max(np.abs(gap).max() for gap in assembly.gaps(poses[0]).values()) < 1e-13
+    a = eqx.filter_jit(joints.system.accelerations)(0.0, y)
+    rates = lambda y: joints.poses(y)[1].coordinates
+    _, found = jax.jvp(rates, (y,), ((y[1], a),))
+    expected = eqx.filter_jit(assembly.system.accelerations)(0.0, poses).coordinates
+    assert np.abs(expected).max() > 1
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-10 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("case", MECHANISMS)
+def test_jacobians_are_derivatives(case):
+    """Of placements and equations of loops, also where the norms of quaternions are not one."""
+    assembly = MECHANISMS[case]()
+    joints = mb.JointCoordinates(assembly)
+    q, v = joints.state(moving(assembly))
+    q = q + 0.1 * np.random.default_rng(0).normal(size=q.shape)
+    equations = joints.system.holonomic
+    found = eqx.filter_jit(equations.jacobian)(0.3, q, None)
+    expected = jax.jit(jax.jacfwd(lambda q: equations(0.3, q, None)))(q)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-14)
+    position = lambda q: joints.poses((q, v))[0].position
+    _, velocity = jax.jvp(position, (q,), (v,))
+    np.testing.assert_allclose(joints.poses((q, v))[1].position, velocity, rtol=0, atol=1e-14)
+
+
+@pytest.mark.parametrize("case", MECHANISMS)
+def test_states_and_poses_are_inverse(case):
+    assembly = MECHANISMS[case]()
+    joints = mb.JointCoordinates(assembly)
+    y = perturbed(joints, joints.state(moving(assembly)))
+    for found, expected in zip(joints.state(joints.poses(y)), y, strict=True):
+        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-13)
+    by_name = assembly.joint_coordinates(joints.poses(y))
+    for name, value in zip(joints.names, y[0], strict=True):
+        if name in by_name:
+            np.testing.assert_allclose(by_name[name], value, rtol=0, atol=1e-14)
+    assert set(joints.names) & set(by_name)
+
+
+@eqx.filter_jit
+def solve(terms, constraint, y0, saveat=None):
+    hook = dfx.Dopri8() if constraint is None else mj.Projected(dfx.Dopri8(), constraint)
+    return mj.diffeqsolve(
+        terms,
+        hook,
+        0.0,
+        0.5,
+        None,
+        y0,
+        saveat=dfx.SaveAt(t1=True) if saveat is None else saveat,
+        stepsize_controller=dfx.PIDController(rtol=1e-11, atol=1e-11),
+    )
+
+
+def test_a_solve_ends_where_that_of_the_assembly_does():
+    assembly = in_the_plane()
+    joints = mb.JointCoordinates(assembly)
+    y0 = moving(assembly)
+    saveat = dfx.SaveAt(ts=jnp.linspace(0.0, 0.5, 6))
+    found = joints.poses(solve(joints.terms, joints.constraint, joints.state(y0), saveat).ys)
+    expected = solve(assembly.system.terms, assembly.system.constraint, y0, saveat).ys
+    for ours, theirs in zip(found, expected, strict=True):
+        np.testing.assert_allclose(ours.coordinates, theirs.coordinates, rtol=0, atol=3e-9)
+    assert max(np.abs(gap).max() for gap in assembly.gaps(found[0]).values()) < 1e-14
+
+
+def chain(mass=0.7, length=0.8):
+    """A double pendulum in space with a hinge and a slider: no loops."""
+    bodies = [
+        mb.Body("upper", 1.0, (0.1, 0.1, 0.01), position=(0, 0, -0.5)),
+        mb.Body("lower", mass, (0.1, 0.1, 0.01), position=(0, 0, -1.4)),
+    ]
+    joints = [
+        mb.Revolute(mb.GROUND, "upper", points=((0, 0, 0), (0, 0, 0.5)), axis=(0, 1, 0)),
+        mb.Prismatic("upper", "lower", points=((0, 0, -length), (0, 0, 0.2)), axis=(0.3, 0, 1)),
+    ]
+    return mb.Assembly(bodies, joints, gravity=GRAVITY)
+
+
+def test_trees_have_no_constraint():
+    assembly = chain()
+    joints = mb.JointCoordinates(assembly)
+    assert joints.constraint is None
+    assert joints.names == ("Revolute ground-upper", "Prismatic upper-lower")
+    y0 = (jnp.array([0.4, 0.1]), jnp.array([1.0, -0.5]))
+    end = joints.poses(jax.tree.map(lambda leaf: leaf[-1], solve(joints.terms, None, y0).ys))
+    before, after = assembly.energy(joints.poses(y0)), assembly.energy(end)
+    np.testing.assert_allclose(after.total, before.total, rtol=1e-9)
+    assert abs(after.kinetic - before.kinetic) > 1
+    with pytest.raises(ValueError, match="there are no constraints. Use `terms`"):
+        joints.system  # noqa: B018
+
+
+def test_gradients_by_numbers_of_the_assembly():
+    """Forward = reverse = differences, for the masses and the points of the joints; vmapped = single."""
+    joints = mb.JointCoordinates(in_the_plane())
+    y0 = joints.state(moving(joints.assembly))
+
+    def end(scale):
+        assembly = joints.assembly
+        points = assembly.joints[0].attachment.points
+        changed = eqx.tree_at(
+            lambda a: (a.bodies.mass, a.joints[0].attachment.points),
+            assembly,
+            (assembly.bodies.mass * scale[0], points.at[1, 1].multiply(scale[1])),
+        )
+        own = eqx.tree_at(lambda j: j.assembly, joints, changed)
+        hook = mj.Projected(dfx.Tsit5(), own.constraint)
+        sol = mj.diffeqsolve(own.terms, hook, 0.0, 0.1, 0.02, y0)
+        return jnp.sum(own.poses(jax.tree.map(lambda leaf: leaf[-1], sol.ys))[0].position ** 2)
+
+    at, h = jnp.array([1.0, 1.0]), 1e-4
+    value, reverse = eqx.filter_jit(jax.value_and_grad(end))(at)
+    forward = eqx.filter_jit(jax.jacfwd(end))(at)
+    moved = at[None] + h * jnp.array([[0.0, 0.0], [1, 0], [-1, 0], [0, 1], [0, -1]])
+    values = eqx.filter_jit(jax.vmap(end))(moved)
+    differences = (values[1::2] - values[2::2]) / (2 * h)
+    np.testing.assert_allclose(reverse, forward, rtol=1e-9)
+    np.testing.assert_allclose(forward, differences, rtol=3e-6)
+    np.testing.assert_allclose(values[0], value, rtol=1e-12)
+
+
+def test_dependent_equations_of_loops_are_left_out():
+    """A four-bar linkage in space: three of the five equations of its last hinge follow from the others."""
+    problem = mj.problems.four_bar()
+    linkage = cases.four_bar_in_space(problem.args, problem.y0)
+    joints = mb.JointCoordinates(linkage.without_dependent_equations())
+    assert len(joints.names) == 3
+    assert joints.independent is not None
+    assert len(joints.independent) == 2
+    y = joints.state()
+    a = eqx.filter_jit(joints.system.accelerations)(0.0, y)
+    _, found = jax.jvp(lambda y: joints.poses(y)[1].coordinates, (y,), ((y[1], a),))
+    hinged = joints.assembly.system
+    expected = eqx.filter_jit(hinged.accelerations)(0.0, joints.poses(y)).coordinates
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-11 * np.abs(expected).max())
+
+
+def test_messages(as_a_user_meets_it):
+    assembly = chain()
+    with pytest.raises(TypeError, match="`assembly` must be an `mj.multibody.Assembly`, got str"):
+        mb.JointCoordinates("robot")
+    joints = mb.JointCoordinates(assembly)
+    q, v = assembly.state(assemble=True)
+    shifted = lambda q: eqx.tree_at(lambda q: q.coordinates, q, q.coordinates.at[1, 1].add(0.1))
+    with pytest.raises(
+        ValueError, match="the positions of 'lower' are not those that the joints allow .gap 0.1"
+    ):
+        joints.state((shifted(q), v))
+    with pytest.raises(ValueError, match="the velocities of 'lower' are not those"):
+        joints.state((q, shifted(v)))
