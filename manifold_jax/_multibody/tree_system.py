@@ -12,9 +12,9 @@ from jaxtyping import Array, Float
 
 from .._base.types import Args, RealScalarLike
 from .._linalg.dense import gram
-from .._mechanics import AbstractPositions
+from .._mechanics import AbstractPositionsWithBias
 from .attachment import Attachment
-from .frames import Placed
+from .frames import Frames, Placed
 from .joint_groups import bodies_of, JointGroup, residuals_of
 from .loads import add
 from .rotations import turn
@@ -71,7 +71,7 @@ class TreeForces(eqx.Module):
         return jnp.sum(along * force[:, None] + about * torque[:, None], axis=(0, 2))
 
 
-class LoopEquations(AbstractPositions):
+class LoopEquations(AbstractPositionsWithBias):
     """The equations of the joints that close loops, of drives, and the norms of quaternions: all, or those
     of the given numbers."""
 
@@ -100,6 +100,29 @@ class LoopEquations(AbstractPositions):
         rows = jnp.concatenate([*loops.jacobian(at, J), norms])
         return rows if self.rows is None else rows[np.array(self.rows)]
 
+    def bias(
+        self, t: RealScalarLike, q: Float[Array, " n"], v: Float[Array, " n"], args: Args
+    ) -> Float[Array, " m"]:
+        assembly = self.source(args)
+        motion = motion_of(assembly, self.tree)
+        numbers = motion.coordinates.quaternions()
+        at = motion.place(q)
+        frames = motion.frames(at, v)
+        accelerations = motion.bias(at, frames, v)
+
+        def rate(t: Any, since: Any) -> tuple[Float[Array, "_ _"], ...]:
+            """Return the time derivatives of the residuals at `t`, when bodies moved since."""
+            path = lambda t, since: Loops.of(assembly.joints_at(t, args), self.tree).along(
+                frames, accelerations, since
+            )
+            return jax.jvp(path, (t, since), (jnp.ones_like(t), jnp.ones_like(since)))[1]
+
+        t, now = jnp.asarray(t, q.dtype), jnp.zeros((), q.dtype)
+        _, found = jax.jvp(rate, (t, now), (jnp.ones_like(t), jnp.ones_like(now)))
+        norms = jnp.sum(v[numbers] ** 2, axis=1)
+        rows = jnp.concatenate([*(part.reshape(-1) for part in found), norms])
+        return rows if self.rows is None else rows[np.array(self.rows)]
+
 
 class Loops(NamedTuple):
     """The joints that are no part of the tree, and drives."""
@@ -117,6 +140,20 @@ class Loops(NamedTuple):
     def _placed(self, at: TreePlacement) -> Placed:
         index = bodies_of(self.groups)
         return Placed(*(part[index] for part in at.placed))
+
+    def along(
+        self, frames: Frames, accelerations: tuple[Array, Array], since: Float[Array, ""]
+    ) -> tuple[Float[Array, "_ _"], ...]:
+        """Return the residuals of bodies that move with these velocities and accelerations, to second order."""
+        index = bodies_of(self.groups)
+        acceleration, turning = (jnp.pad(part, ((0, 1), (0, 0)))[index] for part in accelerations)
+        origin, R, velocity, spin = (part[index] for part in frames)
+        turned = lambda w, R: jnp.cross(w[..., None], R, axis=-2)
+        rate = turned(spin, R)
+        bend = turned(turning, R) + turned(spin, rate)
+        half = since * since / 2
+        origin = origin + since * velocity + half * acceleration
+        return residuals_of(self.groups, Placed(origin, R + since * rate + half * bend))
 
     def jacobian(
         self, at: TreePlacement, J: Float[Array, "b n 6"]
