@@ -89,7 +89,8 @@ def main(
         rows.append(measure(folder, name, seconds))
         console.print(rows[-1])
         if json is not None:
-            write_json(json, environment("pin") | dict(seconds=seconds, rows=rows))
+            found = [dataclasses.asdict(row) for row in rows]
+            write_json(json, environment("pin") | dict(seconds=seconds, rows=found))
     console.print(table(rows))
 
 

@@ -15,6 +15,7 @@ from .._mechanics import MechanicalConstraint, MechanicalSystem
 from .assembly import Assembly
 from .bodies import Pose
 from .checks import is_concrete
+from .frames import Frames
 from .spanning_tree import find_spanning_tree, SpanningTree
 from .start import CLOSED
 from .system import ConstantAssembly
@@ -137,20 +138,14 @@ class JointCoordinates(eqx.Module):
         return y[1], a + jnp.where(mass.usable, 0, jnp.nan).astype(a.dtype)
 
     def _check(self, found: State, y: tuple[Pose, Pose]) -> None:
-        for what, ours, given in zip(
-            ("positions", "velocities"), self.poses(found), y, strict=True
-        ):
-            gap = np.abs(np.asarray(ours.coordinates) - np.asarray(given.coordinates))
-            if not self.assembly.bodies.planar and what == "positions":
-                other = np.abs(np.asarray(ours.coordinates) + np.asarray(given.coordinates))
-                gap[:, 3:] = np.minimum(gap[:, 3:], other[:, 3:])  # a quaternion and its opposite
-            elif what == "positions":
-                gap[:, 2] = np.abs(np.sin(gap[:, 2] / 2))
-            if not gap.max() <= 10 * CLOSED * max(1, np.abs(given.coordinates).max()):
-                body = self.assembly.names[int(gap.max(axis=1).argmax())]
+        ours, given = _frames(*_poses(self._motion, *found)), _frames(*y)
+        for k, what in ((0, "positions"), (2, "velocities")):  # of `Frames`, linear and angular
+            parts = zip(ours[k : k + 2], given[k : k + 2], strict=True)
+            gap = np.max([np.abs(a - b).reshape(len(a), -1).max(axis=1) for a, b in parts], axis=0)
+            if not gap.max() <= 10 * CLOSED * max(1, np.abs(given[k]).max()):
                 raise ValueError(
-                    f"`y`: the {what} of {body!r} are not those that the joints allow (gap {gap.max():.3g}). Make a state by "
-                    "`assembly.state(..., assemble=True)`."
+                    f"`y`: the {what} of {self.assembly.names[int(gap.argmax())]!r} are not those that the joints allow (gap "
+                    f"{gap.max():.3g}). Make a state by `assembly.state(..., assemble=True)`."
                 )
 
     def _find_independent(self) -> tuple[int, ...] | None:
@@ -162,7 +157,8 @@ class JointCoordinates(eqx.Module):
                 "of `jit`, `vmap` and derivatives, and replace `assembly` inside, by `eqx.tree_at`."
             )
         motion, groups = self._motion, self.assembly.joints
-        q, _ = _coordinates_of(motion, self.assembly.state())
+        drawing = self.assembly.bodies.drawing
+        q, _ = _coordinates_of(motion, (drawing, jtu.tree_map(jnp.zeros_like, drawing)))
         passive = tuple(
             () if group.motions is not None else own
             for group, own in zip(groups, self.tree.loops, strict=True)
@@ -177,7 +173,7 @@ class JointCoordinates(eqx.Module):
         # Equations that hold whatever the coordinates are, such as those across the plane of a linkage, count as zero.
         has_size = lengths > _DEPENDENT * lengths.max(initial=0)
         weighted = np.where(has_size, weighted / np.where(has_size, lengths, 1), 0)
-        _, triangle, order = scipy.linalg.qr(weighted.T, mode="economic", pivoting=True)
+        _, triangle, order = scipy.linalg.qr(weighted.T, mode="economic", pivoting=True)  # pyright: ignore[reportAssignmentType]
         pivots = np.abs(np.diagonal(triangle))
         number = int(np.sum(pivots > _DEPENDENT * pivots.max(initial=1e-300)))
         if number == J.shape[0]:
@@ -191,6 +187,7 @@ class JointCoordinates(eqx.Module):
 # One program each, not one for each operation.
 _coordinates_of = eqx.filter_jit(coordinates_of)
 _poses = eqx.filter_jit(poses_of)
+_frames = eqx.filter_jit(Frames.of)
 
 
 @eqx.filter_jit

@@ -47,7 +47,8 @@ class TreeJoints(NamedTuple):
         R = Placed.of(with_ground(bodies.drawing.coordinates)).rotation
         relative = compose(jnp.swapaxes(R[first], 1, 2), R[second])
         drawn = jnp.where(is_free[:, None, None], jnp.eye(3, dtype=dtype)[None], relative)
-        return TreeJoints(first, second, turned, *axes, *points, drawn)
+        ends = first, second, turned
+        return TreeJoints(*ends, axes[0], axes[1], points[0], points[1], drawn)
 
     def second_axis_drawn(self) -> Float[Array, "b 3"]:
         """Return the second axes in the first bodies, in the drawing."""
@@ -107,7 +108,7 @@ class TreeJoints(NamedTuple):
         start = dict(zip(kinds, starts, strict=False))
         columns = coordinates.columns
         place = np.array([start[column.kind] + column.number for column in columns], int)
-        signs = np.array([column.sign for column in columns], dtype)[:, None]
+        signs = jnp.asarray([[column.sign] for column in columns], dtype).reshape(-1, 1)
         return signs * jnp.concatenate(list(kinds.values()), axis=1)[coordinates.bodies, place]
 
 

@@ -41,7 +41,7 @@ def _angles(motion: TreeMotion, q: Float[Array, " n"]) -> Float[Array, " b"]:
     turns = np.array([column.turns * column.sign for column in motion.coordinates.columns])
     is_moved = motion.tree.is_moved()
     by_own, by_turns = is_moved.astype(q.dtype), is_moved[:, motion.coordinates.bodies] * turns
-    return by_own @ own + by_turns.astype(q.dtype) @ q
+    return jnp.asarray(by_own) @ own + jnp.asarray(by_turns.astype(q.dtype)) @ q
 
 
 def _orientations(motion: TreeMotion, q: Float[Array, " n"]) -> Float[Array, "b 4"]:
