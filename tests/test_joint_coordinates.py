@@ -235,6 +235,17 @@ def test_dependent_equations_of_loops_are_left_out():
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-11 * np.abs(expected).max())
 
 
+@pytest.mark.parametrize("case", MECHANISMS)
+def test_single_precision_stays_single(case):
+    joints = mb.JointCoordinates(MECHANISMS[case]())
+    single = lambda leaf: leaf.astype(jnp.float32) if eqx.is_inexact_array(leaf) else leaf
+    y = joints.state(moving(joints.assembly))
+    joints, y = jax.tree.map(single, (joints, y))
+    evaluate = lambda joints, y: (joints.system.accelerations(0.0, y), joints.poses(y))
+    for found in jax.tree.leaves(eqx.filter_eval_shape(evaluate, joints, y)):
+        assert found.dtype == jnp.float32
+
+
 def test_messages(as_a_user_meets_it):
     assembly = chain()
     with pytest.raises(TypeError, match="`assembly` must be an `mj.multibody.Assembly`, got str"):

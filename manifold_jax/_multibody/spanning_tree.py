@@ -51,13 +51,11 @@ class SpanningTree(NamedTuple):
     def is_moved(self) -> np.ndarray:
         """Return whether body `i` is moved by the joint of body `j`, shape `(N, N)`."""
         parents, number = self.parents, len(self.edges)
-        found = np.zeros((number, number), bool)
-        for i in range(number):
-            at = i
-            while at != number:
-                found[i, at] = True
-                at = parents[at]
-        return found
+        found = np.eye(number + 1, dtype=bool)
+        while np.any(parents != number):
+            found = found | found[parents]
+            parents = parents[parents]
+        return found[:number, :number]
 
 
 def find_spanning_tree(groups: tuple[JointGroup, ...], number: int) -> SpanningTree:

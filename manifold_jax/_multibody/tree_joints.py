@@ -117,6 +117,8 @@ def _quaternions(
 ) -> tuple[np.ndarray, Float[Array, "b 4"], Float[Array, " b"]]:
     """Return which joints have quaternions, these, and their lengths: one, but not while a solver corrects them."""
     is_ball = coordinates.quaternion[:, 0] < coordinates.size
-    given = jnp.where(is_ball[:, None], values[coordinates.quaternion], np.eye(1, 4))
+    given = jnp.where(
+        is_ball[:, None], values[coordinates.quaternion], jnp.eye(1, 4, dtype=values.dtype)
+    )
     length = length_of(given)
     return is_ball, given / length[:, None], length

@@ -94,7 +94,8 @@ class TreeMotion(eqx.Module):
     def inertia(self, at: TreePlacement) -> Float[Array, "b 3 3"]:
         """Return the moments of inertia in world coordinates."""
         if self.bodies.planar:
-            return self.bodies.inertia[:, None, None] * np.diag([0.0, 0.0, 1.0])[None]
+            inertia = self.bodies.inertia[:, None, None]
+            return jnp.pad(inertia, ((0, 0), (2, 0), (2, 0)))
         R = at.rotation[:-1]
         return compose(compose(R, self.bodies.inertia), jnp.swapaxes(R, 1, 2))
 
