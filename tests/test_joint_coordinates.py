@@ -97,17 +97,24 @@ def perturbed(joints, y, seed=1):
     return jax.jit(move)((q, v))
 
 
-@pytest.mark.parametrize("case", MECHANISMS)
-def test_accelerations_are_those_in_poses_of_bodies(case):
-    """Also away from the drawing, where every axis has moved."""
-    assembly = MECHANISMS[case]()
+def accelerations_of_poses(joints, y):
+    a = joints.system.accelerations(0.0, y)
+    return jax.jvp(lambda y: joints.poses(y)[1].coordinates, (y,), ((y[1], a),))[1]
+
+
+@pytest.fixture(scope="module", params=MECHANISMS)
+def case(request):
+    """A mechanism, its coordinates, and a state away from the drawing, where every axis has moved."""
+    assembly = MECHANISMS[request.param]()
     joints = mb.JointCoordinates(assembly)
     y = perturbed(joints, joints.state(moving(assembly)))
-    poses = joints.poses(y)
+    return assembly, joints, y, eqx.filter_jit(joints.poses)(y)
+
+
+def test_accelerations_are_those_in_poses_of_bodies(case):
+    assembly, joints, y, poses = case
     assert max(np.abs(gap).max() for gap in assembly.gaps(poses[0]).values()) < 1e-13
-    a = eqx.filter_jit(joints.system.accelerations)(0.0, y)
-    rates = lambda y: joints.poses(y)[1].coordinates
-    _, found = jax.jvp(rates, (y,), ((y[1], a),))
+    found = eqx.filter_jit(accelerations_of_poses)(joints, y)
     expected = eqx.filter_jit(assembly.system.accelerations)(0.0, poses).coordinates
     assert np.abs(expected).max() > 1
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-10 * np.abs(expected).max())
@@ -129,14 +136,11 @@ def test_jacobians_are_derivatives(case):
     np.testing.assert_allclose(joints.poses((q, v))[1].position, velocity, rtol=0, atol=1e-14)
 
 
-@pytest.mark.parametrize("case", MECHANISMS)
 def test_states_and_poses_are_inverse(case):
-    assembly = MECHANISMS[case]()
-    joints = mb.JointCoordinates(assembly)
-    y = perturbed(joints, joints.state(moving(assembly)))
-    for found, expected in zip(joints.state(joints.poses(y)), y, strict=True):
+    assembly, joints, y, poses = case
+    for found, expected in zip(joints.state(poses), y, strict=True):
         np.testing.assert_allclose(found, expected, rtol=0, atol=1e-13)
-    by_name = assembly.joint_coordinates(joints.poses(y))
+    by_name = eqx.filter_jit(assembly.joint_coordinates)(poses)
     for name, value in zip(joints.names, y[0], strict=True):
         if name in by_name:
             np.testing.assert_allclose(by_name[name], value, rtol=0, atol=1e-14)
@@ -228,18 +232,15 @@ def test_dependent_equations_of_loops_are_left_out():
     assert joints.independent is not None
     assert len(joints.independent) == 2
     y = joints.state()
-    a = eqx.filter_jit(joints.system.accelerations)(0.0, y)
-    _, found = jax.jvp(lambda y: joints.poses(y)[1].coordinates, (y,), ((y[1], a),))
+    found = eqx.filter_jit(accelerations_of_poses)(joints, y)
     hinged = joints.assembly.system
     expected = eqx.filter_jit(hinged.accelerations)(0.0, joints.poses(y)).coordinates
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-11 * np.abs(expected).max())
 
 
-@pytest.mark.parametrize("case", MECHANISMS)
 def test_single_precision_stays_single(case):
-    joints = mb.JointCoordinates(MECHANISMS[case]())
+    _, joints, y, _ = case
     single = lambda leaf: leaf.astype(jnp.float32) if eqx.is_inexact_array(leaf) else leaf
-    y = joints.state(moving(joints.assembly))
     joints, y = jax.tree.map(single, (joints, y))
     evaluate = lambda joints, y: (joints.system.accelerations(0.0, y), joints.poses(y))
     for found in jax.tree.leaves(eqx.filter_eval_shape(evaluate, joints, y)):

@@ -63,7 +63,7 @@ def objective(gravity, tolerance, hook, solver, saveat, t1, dense=False, **optio
     return sum(jnp.sum(w * x) for w, x in zip(weights, used)), sol.result == dfx.RESULTS.successful
 
 
-# What is compiled as users compile; the rest with the flags in between.
+# Whose reverse mode is compiled as users compile; the rest with the flags in between.
 AS_USERS = {("projected", "Tsit5"), ("plain", "Kvaerno5")}
 
 
@@ -74,8 +74,8 @@ def check(hook, solver, saveat, t1, tolerances, rtol=1e-12, **options):
     )
     gravities = jnp.array([9.81, 11.0])
     reverse = jit(jax.grad(f, has_aux=True))
-    batch = jit(jax.vmap(jax.grad(f, has_aux=True), in_axes=(0, None)))
-    by_forward = jit(jax.jacfwd(lambda *of: f(*of, adjoint=dfx.ForwardMode()), has_aux=True))
+    batch = medium_jit(jax.vmap(jax.grad(f, has_aux=True), in_axes=(0, None)))
+    by_forward = medium_jit(jax.jacfwd(lambda *of: f(*of, adjoint=dfx.ForwardMode()), has_aux=True))
     for tolerance in tolerances:
         expected, success = by_forward(gravities[0], tolerance)
         assert success
