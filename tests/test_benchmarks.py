@@ -60,6 +60,7 @@ TOO_LONG = {
     "benchmarks.peers.neural",
     "benchmarks.peers.optimal_control",
     "benchmarks.peers.power_grid",
+    "benchmarks.peers.robot_coordinates",
     "benchmarks.peers.robots",
     "benchmarks.peers.stiff",
     "benchmarks.speed.adaptive_gradients",
