@@ -85,20 +85,19 @@ def test_gradients_of_what_is_reported():
         sol = drop(p, 3.0, saveat=saveat, max_steps=64)
         dense = jax.vmap(sol.evaluate)(jnp.array([0.5, 2.0, 2.9]))
         resets = sol.resets
-        return resets.times[:2], resets.before[:2], resets.after[:2], sol.ys, dense
+        time = resets.times[0]
+        both_sides = sol.evaluate(time), sol.evaluate(time, left=False)
+        found = resets.times[:2], resets.before[:2], resets.after[:2], sol.ys, dense
+        return found, (time, both_sides)
 
-    forward = jax.jit(jax.jacfwd(values))(BALL)
-    reverse = jax.jit(jax.jacrev(values))(BALL)
+    forward, (time, (before, after)) = jax.jit(jax.jacfwd(values, has_aux=True))(BALL)
+    reverse, _ = jax.jit(jax.jacrev(values, has_aux=True))(BALL)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-11), forward, reverse)
     exact = jax.jacfwd(bounce_times)(BALL, 2)
     np.testing.assert_allclose(reverse[0], exact, atol=1e-11)
     np.testing.assert_allclose(reverse[3][-1, 0], jax.grad(height)(BALL, 3.0, 2), atol=1e-11)
     np.testing.assert_allclose(reverse[4][1, 0], jax.grad(height)(BALL, 2.0, 1), atol=1e-11)
-    t = bounce_times(BALL, 1)[0]
-    sol = drop(BALL, 3.0, saveat=dfx.SaveAt(dense=True), max_steps=64)
-    time = sol.resets.times[0]
-    np.testing.assert_allclose(time, t, rtol=1e-14)
-    before, after = sol.evaluate(time), sol.evaluate(time, left=False)
+    np.testing.assert_allclose(time, bounce_times(BALL, 1)[0], rtol=1e-14)
     np.testing.assert_allclose(after[1], -0.8 * before[1], rtol=1e-12)
     np.testing.assert_allclose(jnp.stack([before[0], after[0]]), 0, atol=1e-12)
 
@@ -136,9 +135,10 @@ def vibration(p):
 def test_order_of_convergence(solver, order):
     """Of the state and of its gradient, with constant steps; Heun's interpolation is a straight line."""
     p, errors = jnp.array([3.0, -0.3]), []
-    solve = jax.jit(lambda p, dt: (vibrate(p, dt, solver), jax.jacfwd(vibrate)(p, dt, solver)))
+    twice = lambda p, dt: (vibrate(p, dt, solver),) * 2
+    solve = jax.jit(jax.jacfwd(twice, has_aux=True))
     for n in (160, 320) if order > 2 else (640, 1280):
-        y, jacobian = solve(p, jnp.array(4.0 / n))
+        jacobian, y = solve(p, jnp.array(4.0 / n))
         jacobian = jacobian - jax.jacfwd(vibration)(p)
         errors.append([jnp.abs(y - vibration(p)).max(), jnp.abs(jacobian).max()])
     orders = np.log2(np.array(errors[0]) / np.array(errors[1]))
@@ -189,8 +189,13 @@ def test_on_the_manifold_before_and_after(name):
     """To round-off, with equal gradients in both modes, which are those of differences."""
     solver = SOLVERS[name]
     weights = jnp.array([1.0, 2.0, 0.3, 0.4])
-    end = lambda p: (swing(p, solver).ys[0] @ weights, swing(p, solver).resets)
-    _, resets = jax.jit(end)(P)
+
+    def end(p):
+        sol = swing(p, solver)
+        return sol.ys[0] @ weights, sol.resets
+
+    run = jax.jit(end)
+    _, resets = run(P)
     count = int(resets.number)
     assert count == 2
     violation = jax.vmap(lambda y: jnp.max(jnp.abs(CIRCLE(0.0, y, P))))
@@ -202,7 +207,7 @@ def test_on_the_manifold_before_and_after(name):
     np.testing.assert_allclose(reverse, forward, rtol=1e-12)
     h, quotients = 1e-4, []
     for i in range(3):
-        at = [jax.jit(function)(P.at[i].add(k * h)) for k in (-2, -1, 1, 2)]
+        at = [run(P.at[i].add(k * h))[0] for k in (-2, -1, 1, 2)]
         quotients.append((at[0] - 8 * at[1] + 8 * at[2] - at[3]) / (12 * h))
     np.testing.assert_allclose(reverse, quotients, rtol=1e-6)
 
@@ -220,13 +225,16 @@ def test_adjoints_of_diffrax(adjoint):
 def test_batch():
     """Trajectories with different numbers of events are those solved alone; one that fails is told."""
     many = jnp.stack([BALL, BALL.at[2].set(1.0), BALL.at[3].set(3.0), BALL.at[1].set(0.3)])
-    solve = lambda p: drop(p, 3.0, throw=False)
-    together = jax.jit(jax.vmap(lambda p: (solve(p).ys[0], solve(p).resets)))(many)
-    result = jax.jit(jax.vmap(lambda p: solve(p).result == dfx.RESULTS.successful))(many)
+
+    def solve(p):
+        sol = drop(p, 3.0, throw=False)
+        return sol.ys[0], sol.resets, sol.result == dfx.RESULTS.successful
+
+    *together, result = jax.jit(jax.vmap(solve))(many)
     assert result.tolist() == [True, True, True, False]
-    alone = jax.jit(lambda p: (solve(p).ys[0], solve(p).resets))
+    alone = jax.jit(solve)
     for i in range(4):
-        one = alone(many[i])
+        *one, _ = alone(many[i])
         jax.tree.map(
             lambda a, b, i=i: np.testing.assert_allclose(a[i], b, rtol=1e-12, atol=1e-14),
             together,
@@ -247,14 +255,15 @@ def test_three_roots_in_one_step():
         reset = mj.Reset(lambda t, y, args: y[0], lambda t, y, args: jnp.stack([y[0], y[1] + 1.0]))
         y0 = jnp.stack([-a * b * c, jnp.zeros_like(a)])
         sol = mj.diffeqsolve(dfx.ODETerm(field), dfx.Tsit5(), 0.0, 10.0, 10.0, y0, resets=(reset,))
-        return sol.resets.times[:3], (sol.resets.number, sol.ys[0, 1])
+        times = sol.resets.times[:3]
+        return times, (times, sol.resets.number, sol.ys[0, 1])
 
     roots = jnp.array([1.0, 2.0, 3.0])
-    times, (number, count) = cubic(roots)
+    slopes, (times, number, count) = jax.jit(jax.jacrev(cubic, has_aux=True))(roots)
     assert number == 3
     assert count == 3
     np.testing.assert_allclose(times, roots, rtol=1e-14)
-    np.testing.assert_allclose(jax.jacrev(cubic, has_aux=True)(roots)[0], np.eye(3), atol=1e-13)
+    np.testing.assert_allclose(slopes, np.eye(3), atol=1e-13)
 
 
 def doses(p, times, **options):
@@ -287,7 +296,13 @@ def test_known_times():
     unit of rounding before it is that before."""
     p, times = jnp.array([1.1, 0.3, 5.0]), jnp.array([18.0, 0.0, 6.0, 12.0, 24.0, 30.0, -1.0])
     ts = jnp.array([0.0, np.nextafter(6.0, 0), 6.0, np.nextafter(6.0, 7), 18.0, 24.0])
-    sol = doses(p, times, saveat=dfx.SaveAt(ts=ts))
+
+    def end(p, times):
+        sol = doses(p, times, saveat=dfx.SaveAt(ts=ts))
+        return sol.ys[-1, 1], sol
+
+    derivatives = [jax.jit(mode(end, (0, 1), has_aux=True)) for mode in (jax.grad, jax.jacfwd)]
+    (reverse, sol), (forward, _) = (derivative(p, times) for derivative in derivatives)
     assert sol.resets.times[:5].tolist() == [0.0, 6.0, 12.0, 18.0, np.inf]
     inside = times.at[jnp.array([4, 6])].set(
         40.0
@@ -295,10 +310,8 @@ def test_known_times():
     exact = jax.vmap(lambda t: concentrations(p, inside, t))(ts)
     np.testing.assert_allclose(sol.ys, exact, atol=3e-9)
     np.testing.assert_allclose(sol.ys[2] - sol.ys[1], [5.0, 0.0], atol=1e-12)
-    end = lambda p, times: doses(p, times).ys[0, 1]
     exact = jax.grad(lambda p, times: concentrations(p, times, 24.0)[1], (0, 1))(p, inside)
-    for derivative in (jax.grad, jax.jacfwd):
-        of_p, of_times = jax.jit(derivative(end, (0, 1)))(p, times)
+    for of_p, of_times in (reverse, forward):
         np.testing.assert_allclose(of_p, exact[0], rtol=1e-7)
         np.testing.assert_allclose(of_times, exact[1], atol=1e-8)
 
@@ -461,19 +474,20 @@ def test_an_event_ends_a_solve_with_resets():
             lambda t, y, args, **kwargs: y[1] - 2.0, optx.Newton(1e-12, 1e-12), direction
         )
         sol = drop(p, event=event)
-        return sol.ts[0], (sol.ys[0], sol.result)
+        return sol.ts[0], (sol.ts[0], sol.ys[0], sol.result)
 
     exact = lambda p: (
         bounce_times(p, 1)[0] + (p[1] * jnp.sqrt(p[3] ** 2 + 2 * p[0] * p[2]) - 2) / p[0]
     )
-    time, (y, result) = stop(BALL, False)
+    ends = lambda p: stop(p, False)
+    derivatives = [jax.jit(mode(ends, has_aux=True)) for mode in (jax.jacfwd, jax.jacrev)]
+    (forward, (time, y, result)), (reverse, _) = (derivative(BALL) for derivative in derivatives)
     assert result == dfx.RESULTS.event_occurred
     np.testing.assert_allclose(time, exact(BALL), rtol=1e-12)
     np.testing.assert_allclose(y[1], 2.0, rtol=1e-12)
-    for derivative in (jax.jacfwd, jax.jacrev):
-        of_time, _ = jax.jit(derivative(lambda p: stop(p, False), has_aux=True))(BALL)
+    for of_time in (forward, reverse):
         np.testing.assert_allclose(of_time, jax.grad(exact)(BALL), rtol=1e-9)
-    time, (y, result) = stop(BALL, True)
+    _, (time, y, result) = stop(BALL, True)
     assert result == dfx.RESULTS.event_occurred
     np.testing.assert_allclose(time, bounce_times(BALL, 1)[0], rtol=1e-13)
     np.testing.assert_allclose(y, [0.0, 0.8 * np.sqrt(100.01)], atol=1e-9)
@@ -493,19 +507,20 @@ def test_algebraic_states_follow_from_the_state_after_a_jump():
         sol = mj.diffeqsolve(
             term, mj.Rodas5P(), 0.0, 1.0, None, y0, k, resets=(refill,), stepsize_controller=PID
         )
-        return sol.ys[0], sol.resets
+        return sol.ys[0], (sol.ys[0], sol.resets)
 
     def exact(k):  # from 1 to 0.5, then from 1.5
         x = 1.5 * jnp.exp(-k * (1.0 - jnp.log(2.0) / k))
         return jnp.stack([x, k * x])
 
     k = jnp.array(1.3)
-    y, resets = solve(k)
+    modes = jax.jacfwd, jax.jacrev
+    found = [jax.jit(mode(solve, has_aux=True))(k) for mode in modes]
+    _, (y, resets) = found[0]
     np.testing.assert_allclose(resets.after[0], [1.5, 1.5 * 1.3], rtol=1e-9)
     np.testing.assert_allclose(y, exact(k), rtol=1e-8)
-    end = lambda k: solve(k)[0]
-    for derivative in (jax.jacfwd, jax.jacrev):
-        np.testing.assert_allclose(jax.jit(derivative(end))(k), jax.jacfwd(exact)(k), rtol=1e-6)
+    for slope, _ in found:
+        np.testing.assert_allclose(slope, jax.jacfwd(exact)(k), rtol=1e-6)
 
 
 def test_a_limited_number_and_clipped_steps():
@@ -532,11 +547,15 @@ def test_a_limited_number_and_clipped_steps():
 def test_single_precision():
     with jax.enable_x64(False):
         p = jnp.array(BALL, jnp.float32)
-        sol = drop(p, 3.0, stepsize_controller=dfx.PIDController(rtol=1e-4, atol=1e-4))
+
+        def end(p):
+            sol = drop(p, 3.0, stepsize_controller=PID32)
+            return sol.ys[0, 0], sol
+
+        gradient, sol = jax.jit(jax.grad(end, has_aux=True))(p)
         assert sol.ys.dtype == sol.resets.times.dtype == jnp.float32
         assert sol.resets.number == 2
         np.testing.assert_allclose(sol.resets.times[:2], bounce_times(p, 2), rtol=1e-5)
-        gradient = jax.grad(lambda p: drop(p, 3.0, stepsize_controller=PID32).ys[0, 0])(p)
     np.testing.assert_allclose(gradient, jax.grad(height)(BALL, 3.0, 2), rtol=1e-3)
 
 
@@ -641,7 +660,8 @@ def test_an_event_that_a_jump_causes():
             resets=(first, second),
             max_resets=5,
         )
-        return sol.ys[0], sol.resets.times[1], sol.resets.number
+        found = sol.ys[0], sol.resets.times[1]
+        return found, (*found, sol.resets.number)
 
     def exact(p):
         """Both at the time `p`; then x = 5 p + (t - p), and y grows by its integral."""
@@ -651,10 +671,10 @@ def test_an_event_that_a_jump_causes():
         return jnp.stack([x + left, y]), p
 
     p = jnp.array(1.1)
-    state, time, number = solve(p)
-    assert number == 2
     for mode in (jax.jacfwd, jax.jacrev):
-        for ours, slope in zip(mode(lambda p: solve(p)[:2])(p), jax.jacfwd(exact)(p), strict=True):
+        slopes, (state, time, number) = jax.jit(mode(solve, has_aux=True))(p)
+        assert number == 2
+        for ours, slope in zip(slopes, jax.jacfwd(exact)(p), strict=True):
             np.testing.assert_allclose(ours, slope, rtol=1e-11)
     np.testing.assert_allclose(state, exact(p)[0], rtol=1e-12)
     np.testing.assert_allclose(time, p, rtol=1e-14)
@@ -683,7 +703,7 @@ def test_gradient_of_a_value_saved_at_the_time_of_a_jump():
         [jnp.ones(1), jnp.array([3, 3, 9 / jnp.e, 9 / jnp.e, 9 / jnp.e]) * decay]
     )
     for mode in (jax.jacfwd, jax.jacrev):
-        np.testing.assert_allclose(mode(saved)(jnp.ones(())), slope, rtol=1e-8)
+        np.testing.assert_allclose(jax.jit(mode(saved))(jnp.ones(())), slope, rtol=1e-8)
 
 
 def test_each_of_many_events_at_one_time_happens_once():
