@@ -84,11 +84,17 @@ def test_a_machine_without_freedom():
     np.testing.assert_allclose(torque, power / speed, rtol=0, atol=1e-10)
 
 
-def reference(acceleration, y0):
+def reference(acceleration, y0, *args):
     """Of one coordinate, by SciPy."""
     f = jax.jit(acceleration)
     found = scipy.integrate.solve_ivp(
-        lambda t, y: [y[1], f(t, *y)], (TS[0], TS[-1]), y0, "DOP853", TS, rtol=1e-12, atol=1e-12
+        lambda t, y: [y[1], f(t, *y, *args)],
+        (TS[0], TS[-1]),
+        y0,
+        "DOP853",
+        TS,
+        rtol=1e-12,
+        atol=1e-12,
     )
     return found.y[0]
 
@@ -106,13 +112,22 @@ def test_a_driven_slider():
     ]
     crane = mb.Assembly(bodies, joints, gravity=(0.0, -9.81))
     y0 = crane.state(angular_velocities={"load": 0.4}, assemble=True, args=0.8)
-    sol = solve(crane.system, y0, 0.8)
+
+    def swung(rate):
+        ys = solve(crane.system, y0, rate).ys
+        angles = crane.joint_coordinates(ys)["rope"]
+        return angles[-1], angles
+
+    # One program for the solution and its gradient.
+    (_, angles), slope = jax.jit(jax.value_and_grad(swung, has_aux=True))(0.8)
     inertia, ml = 0.3 + 2.0 * 1.5**2, 2.0 * 1.5
-    swing = lambda t, a, rate: -ml * (9.81 * jnp.sin(a) + 2 * 0.8 * jnp.cos(a)) / inertia
-    expected = reference(swing, [0.0, 0.4])
-    np.testing.assert_allclose(crane.joint_coordinates(sol.ys)["rope"], expected, rtol=0, atol=1e-9)
+    swing = lambda t, a, rate, drive: -ml * (9.81 * jnp.sin(a) + 2 * drive * jnp.cos(a)) / inertia
+    expected = lambda drive: reference(swing, [0.0, 0.4], drive)
+    np.testing.assert_allclose(angles, expected(0.8), rtol=0, atol=1e-9)
+    difference = (expected(0.8 + 1e-4)[-1] - expected(0.8 - 1e-4)[-1]) / 2e-4
+    np.testing.assert_allclose(slope, difference, rtol=1e-6)
     force = crane.joint_forces(0.0, y0, 0.8)["motor"].force
-    a2 = swing(0.0, 0.0, 0.4)  # hangs straight down at the start
+    a2 = swing(0.0, 0.0, 0.4, 0.8)  # hangs straight down at the start
     np.testing.assert_allclose(force, [(3.0 + 2.0) * 1.6 + ml * a2, 0.0], rtol=0, atol=1e-12)
 
 
@@ -130,9 +145,9 @@ def furuta(args):
     return mb.Assembly(bodies, joints, gravity=(0.0, 0.0, -9.81))
 
 
-def furuta_acceleration(t, b, rate):
+def furuta_acceleration(t, b, rate, drive):
     def lagrangian(t, b, rate):
-        speed, y, y_rate = 3.0 * t, 0.4 * jnp.sin(b), 0.4 * jnp.cos(b) * rate
+        speed, y, y_rate = 2 * drive * t, 0.4 * jnp.sin(b), 0.4 * jnp.cos(b) * rate
         z, z_rate = -0.4 * jnp.cos(b), y * rate
         velocity = jnp.stack([-speed * y, speed + y_rate, z_rate])
         spin = jnp.stack([rate, speed * jnp.sin(b), speed * jnp.cos(b)])
@@ -148,21 +163,28 @@ def furuta_acceleration(t, b, rate):
 def test_a_driven_hinge_in_space():
     robot, system = furuta(1.5), mb.parametrized(furuta)
     y0 = robot.state(angular_velocities={"pendulum": (1.0, 0.0, 0.0)}, assemble=True, args=1.5)
-    expected = reference(furuta_acceleration, [0.0, 1.0])
 
-    def hinge(rate):
-        sol = solve(system, y0, rate)
-        return robot.joint_coordinates(sol.ys)["hinge"], sol
-
-    run = jax.jit(hinge)
-    found, sol = run(1.5)
+    expected = reference(furuta_acceleration, [0.0, 1.0], 1.5)
+    sol = solve(system, y0, 1.5)
+    found = robot.joint_coordinates(sol.ys)["hinge"]
     np.testing.assert_allclose(found, expected, rtol=0, atol=2e-9)
     end = jax.tree.map(lambda leaf: leaf[-1], sol.ys)
     assert mj.constraint_violation(system.constraint, TS[-1], end, 1.5) < 1e-15
-    slope = jax.jit(jax.grad(lambda rate: hinge(rate)[0][-1]))(1.5)
-    last = lambda rate: run(rate)[0][-1]
-    difference = (last(1.5 + 1e-5) - last(1.5 - 1e-5)) / 2e-5
-    np.testing.assert_allclose(slope, difference, rtol=1e-6)
+
+    def hinge_speed(q, v):
+        angle = lambda q: robot.joint_coordinates((q, v))["hinge"]
+        return jax.jvp(angle, (q,), (v,))[1]
+
+    def hinge_acceleration(rate):
+        """At the start, whose angles and speeds are the same for all rates."""
+        q, v = jax.tree.map(jnp.asarray, y0)
+        return jax.jvp(hinge_speed, (q, v), (v, system.accelerations(0.0, y0, rate)))[1]
+
+    derivatives = lambda f: (jax.grad(f), jax.jacfwd(f))
+    found = jax.jit(lambda rate: [slope(rate) for slope in derivatives(hinge_acceleration)])(1.5)
+    exact = jax.grad(furuta_acceleration, 3)(0.0, 0.0, 1.0, 1.5)
+    assert abs(exact) > 0.1
+    np.testing.assert_allclose(found, [exact] * 2, rtol=1e-12)
 
 
 def test_a_start_that_the_drive_does_not_allow():
