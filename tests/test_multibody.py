@@ -327,19 +327,15 @@ def test_gradients_and_batches():
     system = mb.parametrized(swing)
     value = lambda values: swung(system, drawn(values), values)
     closed_over = lambda values: swung(swing(values).system, drawn(values), None)
-    run, single = jax.jit(jax.vmap(value)), jax.jit(jax.value_and_grad(value))
-    h, eye = 1e-5, jnp.eye(3)
-    ahead, behind = run(jnp.concatenate([values[None] + h * eye, values[None] - h * eye])).reshape(
-        2, 3
-    )
-    differences = (ahead - behind) / (2 * h)
-    at, slope = single(values)
+    run, slope = jax.jit(value), jax.jit(jax.grad(value))(values)
+    h = 1e-5
+    differences = [(run(values + h * e) - run(values - h * e)) / (2 * h) for e in np.eye(3)]
     np.testing.assert_allclose(slope, differences, rtol=1e-6, atol=1e-8)
     other = jax.jit(jax.grad(closed_over))(values)
     np.testing.assert_allclose(other, slope, rtol=1e-9)
-    batch = values[None] * jnp.asarray([[1.0], [1.3], [1.0], [1.3], [1.0], [1.3]])
-    expected = [at, single(batch[1])[0]] * 3
-    np.testing.assert_allclose(run(batch), expected, rtol=0, atol=1e-13)
+    batch = values[None] * jnp.asarray([[1.0], [1.3]])
+    single = [run(row) for row in batch]
+    np.testing.assert_allclose(jax.jit(jax.vmap(value))(batch), single, rtol=0, atol=1e-13)
 
 
 def test_a_mechanism_is_built_once_in_a_solve():
