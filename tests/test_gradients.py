@@ -90,13 +90,14 @@ def differences(f, x, step):
 
 @pytest.mark.parametrize("where", ["args", "leaf", "closure"])
 def test_modes_agree_and_equal_differences(where):
-    reverse = jax.jit(jax.grad(objective), static_argnums=(1, 2))(THETA, ADJOINTS["reverse"], where)
+    run = jax.jit(jax.value_and_grad(lambda x: objective(x, ADJOINTS["reverse"], where)))
+    reverse = run(THETA)[1]
     forward = jax.jit(jax.jacfwd(objective), static_argnums=(1, 2))(
         THETA, ADJOINTS["forward"], where
     )
     np.testing.assert_allclose(reverse, forward, rtol=1e-10)
-    value = jax.jit(lambda theta: objective(theta, ADJOINTS["forward"], where))
-    np.testing.assert_allclose(forward, differences(value, THETA, 1e-3), rtol=1e-7)
+    expected = differences(lambda theta: run(theta)[0], THETA, 1e-3)
+    np.testing.assert_allclose(forward, expected, rtol=1e-7)
 
 
 def test_hessian_vector_product():
@@ -123,8 +124,8 @@ def test_sensitivities_are_tangent():
     def trajectory(theta):
         return pendulum_end(theta, ADJOINTS["forward"], "args", STEPS, saveat).ys
 
-    q, v = trajectory(THETA)
-    dq, dv = jax.jit(jax.jacfwd(trajectory))(THETA)
+    twice = lambda theta: (trajectory(theta),) * 2
+    (dq, dv), (q, v) = jax.jit(jax.jacfwd(twice, has_aux=True))(THETA)
     length = np.array([0.0, 2 * THETA[1], 0.0, 0.0])
     np.testing.assert_allclose(2 * np.einsum("ti,tip->tp", q, dq) - length, 0, atol=1e-12)
     velocity = np.einsum("ti,tip->tp", v, dq) + np.einsum("ti,tip->tp", q, dv)
@@ -151,14 +152,13 @@ def test_outside_problem_time_dependent():
         return jfu.ravel_pytree(sol.ys)[0] @ jnp.array([1.0, 2.0, -1.0])
 
     omega = jnp.asarray(outside.OMEGA)
-    by_reverse = jax.jit(lambda w, *rest: jax.grad(solve)(w, ADJOINTS["reverse"], *rest))
+    run = jax.jit(lambda w, *rest: jax.value_and_grad(solve)(w, ADJOINTS["reverse"], *rest))
     by_forward = jax.jit(lambda w, *rest: jax.jacfwd(solve)(w, ADJOINTS["forward"], *rest))
-    value = jax.jit(lambda w, *rest: solve(w, ADJOINTS["forward"], *rest))
     for span in ((outside.T0, 2.2), (2.2, outside.T0)):
         start = jax.tree.map(jnp.asarray, outside.exact(span[0]))
-        reverse, forward = by_reverse(omega, span, start), by_forward(omega, span, start)
+        reverse, forward = run(omega, span, start)[1], by_forward(omega, span, start)
         np.testing.assert_allclose(reverse, forward, rtol=1e-10)
-        expected = differences(lambda w, s=span, y=start: value(w, s, y), omega, 1e-3)
+        expected = differences(lambda w, s=span, y=start: run(w, s, y)[0], omega, 1e-3)
         np.testing.assert_allclose(forward, expected, rtol=1e-7)
 
 
@@ -182,8 +182,8 @@ def test_gradient_of_an_inconsistent_start():
         return jfu.ravel_pytree(sol.ys)[0] @ WEIGHTS
 
     flat, unravel = jfu.ravel_pytree((jnp.array([1.1, 0.2]), jnp.array([0.3, 0.1])))
-    reverse = jax.jit(lambda x: jax.grad(lambda x: end(unravel(x), ADJOINTS["reverse"]))(x))(flat)
+    run = jax.jit(jax.value_and_grad(lambda x: end(unravel(x), ADJOINTS["reverse"])))
+    reverse = run(flat)[1]
     forward = jax.jit(lambda x: jax.jacfwd(lambda x: end(unravel(x), ADJOINTS["forward"]))(x))(flat)
-    value = jax.jit(lambda x: end(unravel(x), ADJOINTS["forward"]))
     np.testing.assert_allclose(reverse, forward, rtol=1e-10)
-    np.testing.assert_allclose(forward, differences(value, flat, 1e-3), rtol=1e-7)
+    np.testing.assert_allclose(forward, differences(lambda x: run(x)[0], flat, 1e-3), rtol=1e-7)

@@ -1,6 +1,7 @@
 """Jumps of the state in ensembles, in memory and on disk, and in fits."""
 
 import diffrax as dfx
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -52,28 +53,29 @@ def many(starts, args, **options):
 def test_an_ensemble_is_one_by_one():
     """From a few to many resets, at times of its own in each trajectory: states, times and derivatives."""
 
-    def loss(ys):
-        return jnp.sum(ys[..., -1, :] ** 2)
+    def with_gradient(solve):
+        def loss(starts, args):
+            sol = solve(starts, args)
+            return jnp.sum(sol.ys[..., -1, :] ** 2), sol
+
+        return eqx.filter_jit(jax.grad(loss, argnums=(0, 1), has_aux=True))
 
     one = lambda start, args: mj.diffeqsolve(
         FALL, dfx.Tsit5(), 0.0, 2.0, None, start, args, **OPTIONS
     )
-    alone = jax.jit(one)
-    slope = jax.jit(jax.grad(lambda start, args: loss(one(start, args).ys), argnums=(0, 1)))
-    slopes = jax.jit(jax.grad(lambda *of: loss(many(*of).ys), argnums=(0, 1)))(STARTS, ARGS)
-    ensemble = many(STARTS, ARGS)
+    alone = with_gradient(one)
+    slopes, ensemble = with_gradient(many)(STARTS, ARGS)
     assert not ensemble.failed.any()
     assert ensemble.execution == "mapped over, not in lanes: there are `resets`"
     assert ensemble.resets.number.min() <= 4
     assert ensemble.resets.number.max() >= 15
     common = 0.0
     for i in range(SIZE):
-        sol = alone(STARTS[i], of_one(ARGS, i))
+        (by_start, by_args), sol = alone(STARTS[i], of_one(ARGS, i))
         assert sol.resets.number == ensemble.resets.number[i]
         assert sol.stats["num_steps"] == ensemble.stats["num_steps"][i]
         np.testing.assert_allclose(ensemble.ys[i], sol.ys, rtol=1e-12, atol=1e-12)
         np.testing.assert_allclose(ensemble.resets.times[i], sol.resets.times, rtol=1e-13)
-        by_start, by_args = slope(STARTS[i], of_one(ARGS, i))
         np.testing.assert_allclose(slopes[0][i], by_start, rtol=1e-9, atol=1e-9)
         np.testing.assert_allclose(slopes[1]["kicks"][i], by_args["kicks"], rtol=1e-9, atol=1e-9)
         common += by_args["strength"]
