@@ -105,3 +105,46 @@ def test_singular_drawings_and_traced_numbers_are_refused():
 def test_assemblies_without_dependent_equations_stay_as_they_are():
     arm = mb.Assembly([mb.Body("arm", 1.0, 0.1)], [mb.Revolute("arm", mb.GROUND, at=(0.0, 0.0))])
     assert arm.without_dependent_equations().independent is None
+
+
+def on_a_turntable():
+    """A four-bar linkage in the plane of x and z, its last joint a ball joint; the table turns about z."""
+    rods = {"crank": (0, 0, 0.25), "coupler": (0.4, 0, 0.6), "rocker": (0.8, 0, 0.35)}
+    bodies = [mb.Body(name, 1.0, (0.1, 0.12, 0.05), position=at) for name, at in rods.items()]
+    bodies.append(mb.Body("table", 3.0, (1.0, 1.0, 1.0)))
+    y = (0.0, 1.0, 0.0)
+    joints = [
+        mb.Revolute(mb.GROUND, "table", at=(0, 0, 0), axis=(0, 0, 1)),
+        mb.Revolute("table", "crank", at=(0, 0, 0), axis=y),
+        mb.Revolute("crank", "coupler", at=(0, 0, 0.5), axis=y),
+        mb.Revolute("table", "rocker", at=(0.8, 0, 0), axis=y),
+        mb.Spherical("coupler", "rocker", at=(0.8, 0, 0.7)),
+    ]
+    return mb.Assembly(bodies, joints).without_dependent_equations()
+
+
+def turned(robot, angle):
+    """The drawing, turned about z."""
+    half = jnp.asarray(mb.quaternion((0, 0, 1), angle))
+    q = robot.bodies.drawing
+    c, s = jnp.cos(angle), jnp.sin(angle)
+    R = jnp.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    return mb.Pose(q.position @ R.T, jnp.broadcast_to(half, q.orientation.shape))
+
+
+def test_the_choice_holds_when_the_plane_of_a_linkage_turns():
+    """What follows from the other equations is across that plane."""
+    robot = on_a_turntable()
+    joints = mb.JointCoordinates(robot)
+    assert len(joints.independent) == 2
+    in_poses = eqx.filter_jit(lambda q: robot.system.holonomic.jacobian(0.0, q, None))
+    in_joints = eqx.filter_jit(lambda q: joints.system.holonomic.jacobian(0.0, q, None))
+    place = dict(zip(joints.names, range(4)))["Revolute ground-table"]
+    smallest = lambda J: np.linalg.svd(J, compute_uv=False)[-1]
+    expected = smallest(in_poses(turned(robot, 0.0))), smallest(in_joints(jnp.zeros(4)))
+    for angle in (0.5, np.pi / 2, 2.5):
+        found = (
+            smallest(in_poses(turned(robot, angle))),
+            smallest(in_joints(jnp.zeros(4).at[place].set(angle))),
+        )
+        np.testing.assert_allclose(found, expected, rtol=1e-9)

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 
 from . import joints
 from .attachment import Sides
-from .rotations import dot
+from .rotations import dot, turn_back
 
 
 def _columns(*parts: Float[Array, " k"]) -> Float[Array, "k r"]:
@@ -22,6 +22,13 @@ def _columns(*parts: Float[Array, " k"]) -> Float[Array, "k r"]:
 
 def _beside(several: Float[Array, "k r"], *parts: Float[Array, " k"]) -> Float[Array, "k more"]:
     return jnp.concatenate([several, _columns(*parts)], axis=1)
+
+
+def _gap(s: Sides) -> Float[Array, "k 3"]:
+    """Return the components of `d` along the axes of the first body. Those in the world would not do: where the
+    equation across the plane of a linkage follows from the others, it would be another one whenever the plane
+    turns."""
+    return turn_back(s.frame_first, s.gap)
 
 
 def _cylindrical(s: Sides, length: Any) -> Float[Array, "k 4"]:
@@ -47,12 +54,14 @@ def _driven_angle(s: Sides, target: Float[Array, " k"]) -> Float[Array, "k 1"]:
 
 
 SPATIAL: dict[type, Callable] = {
-    joints.Spherical: lambda s, length: s.gap,
-    joints.Revolute: lambda s, length: _beside(s.gap, s.cosine(0, 2), s.cosine(1, 2)),
-    joints.Universal: lambda s, length: _beside(s.gap, s.cosine(2, 2)),
+    joints.Spherical: lambda s, length: _gap(s),
+    joints.Revolute: lambda s, length: _beside(_gap(s), s.cosine(0, 2), s.cosine(1, 2)),
+    joints.Universal: lambda s, length: _beside(_gap(s), s.cosine(2, 2)),
     joints.Cylindrical: _cylindrical,
     joints.Prismatic: lambda s, length: _beside(_cylindrical(s, length), s.cosine(0, 1)),
-    joints.Fixed: lambda s, length: _beside(s.gap, s.cosine(0, 2), s.cosine(1, 2), s.cosine(0, 1)),
+    joints.Fixed: lambda s, length: _beside(
+        _gap(s), s.cosine(0, 2), s.cosine(1, 2), s.cosine(0, 1)
+    ),
     joints.Distance: _distance,
 }
 PLANAR: dict[type, Callable] = {
