@@ -114,7 +114,9 @@ def test_one_gradient_of_the_dense_solution():
 def test_one_gradient_at_all_tolerances(hook):
     """In a batch; alone only the most used, as it is the same rule for all hooks."""
     tolerances = (1e-6, 1e-8, 1e-10, 1e-12)
-    check(hook, "Tsit5", dfx.SaveAt(t1=True), 10.0, tolerances, alone=hook in ("plain", "projected"))
+    check(
+        hook, "Tsit5", dfx.SaveAt(t1=True), 10.0, tolerances, alone=hook in ("plain", "projected")
+    )
 
 
 @pytest.mark.slow
