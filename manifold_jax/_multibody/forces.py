@@ -116,7 +116,7 @@ class Controller(AbstractForce):
 
     - `joints`: the names of [`Revolute`][] and [`Prismatic`][] joints, `k` of them.
     - `law`: `f(t, y, args)` returns the values `(k,)`, with signs as for [`Motor`][]; `y = (q, v)` is the
-        state of the solve.
+        state of the assembly, the poses of all bodies and their rates.
     - `name`: by default made from the names of the joints.
 
     Its torques are not part of `Assembly.energy`. For values that do not depend on the state use [`Motor`][].
