@@ -94,7 +94,7 @@ class JointCoordinates(eqx.Module):
         source = ConstantAssembly(self.assembly)
         equations = LoopEquations(source, self.tree, self.independent)
         mass, forces = TreeMass(source, self.tree), TreeForces(source, self.tree)
-        redundant = self.assembly.redundant and self.independent is None
+        redundant = self.assembly.redundant and self.assembly.independent is None
         return MechanicalSystem(mass, equations, forces, redundant=redundant, structure="dense")
 
     @property
