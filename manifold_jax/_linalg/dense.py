@@ -59,6 +59,36 @@ class Library(eqx.Module):
         return lapack.lu_solve_transposed(*self.lu, b)
 
 
+class Cholesky(eqx.Module):
+    """`A = L L^T` by LAPACK or cuSOLVER."""
+
+    lower: Float[Array, "m m"]
+
+    def solve(self, b: Float[Array, "m ..."]) -> Float[Array, "m ..."]:
+        return lapack.cholesky_solve(self.lower, b)
+
+    def solve_transposed(self, b: Float[Array, "m ..."]) -> Float[Array, "m ..."]:
+        return self.solve(b)
+
+
+class Equilibrated(eqx.Module):
+    """The factors of `A` after multiplying its rows and columns by these numbers."""
+
+    rows: Float[Array, " m"]
+    columns: Float[Array, " m"]
+    factors: Any  # with `solve` and `solve_transposed`
+
+    def solve(self, b: Inexact[Array, "m ..."]) -> Inexact[Array, "m ..."]:
+        return _scaled(self.columns, self.factors.solve(_scaled(self.rows, b)))
+
+    def solve_transposed(self, b: Inexact[Array, "m ..."]) -> Inexact[Array, "m ..."]:
+        return _scaled(self.rows, self.factors.solve_transposed(_scaled(self.columns, b)))
+
+
+def _scaled(size: Float[Array, " m"], b: Inexact[Array, "m ..."]) -> Inexact[Array, "m ..."]:
+    return size.reshape(-1, *(1,) * (b.ndim - 1)) * b
+
+
 class Inverse(eqx.Module):
     """The inverse of a matrix, or its pseudo-inverse."""
 
@@ -114,10 +144,9 @@ def factorize(A: Float[Array, "m m"]) -> Factorization:
     matrix `A = G W^-1 G^T` that ratio is the squared sine of the angle between one row of `G` and the
     span of those before it, and rounding leaves about `eps` of it.
     """
-    m, fixed = A.shape[0], jax.lax.stop_gradient(A)
-    if m > UNROLL_LIMIT:
-        return _by_library(A, *_lu_of_full_rank(fixed))
-    return Factorization(A, *eliminate(fixed), _product)
+    if A.shape[0] > UNROLL_LIMIT:
+        return _by_library(A, _by_lu)
+    return Factorization(A, *eliminate(jax.lax.stop_gradient(A)), _product)
 
 
 # Redundant equations depend on each other only nearly at a stage off the manifold: eigenvalues of `A`
@@ -162,36 +191,42 @@ def factorize_positive(A: Float[Array, "m m"]) -> Factorization:
     """Factor a symmetric matrix; its rank counts as full if it is positive definite."""
     if A.shape[0] <= UNROLL_LIMIT:
         return factorize(A)  # requires positive pivots, too
-    return _by_library(A, *_lu_of_positive(jax.lax.stop_gradient(A)))
+    return _by_library(A, _by_cholesky)
 
 
-@lapack.one_after_the_other
-def _lu_of_full_rank(A: Float[Array, "m m"]) -> tuple[tuple[Array, Array], BoolScalar]:
-    pivots = jnp.diagonal(lapack.lu_factor(_equilibrated(A))[0])
-    full_rank = jnp.all(jnp.abs(pivots) > rank_threshold(A))
-    return lapack.lu_factor(_or_identity(A, full_rank)), full_rank
+def _by_lu(A: Float[Array, "m m"]) -> tuple[Equilibrated, BoolScalar]:
+    size = _size(A)
+    lu, permutation = lapack.lu_factor(_scaled(size, A) * size[None, :])
+    full_rank = jnp.all(jnp.abs(_diagonal(lu)) > rank_threshold(A))
+    return Equilibrated(size, size, Library((_or_identity(lu, full_rank), permutation))), full_rank
 
 
-@lapack.one_after_the_other
-def _lu_of_positive(A: Float[Array, "m m"]) -> tuple[tuple[Array, Array], BoolScalar]:
-    lower = lapack.cholesky(_equilibrated(A))
-    positive = jnp.all(jnp.diagonal(lower) ** 2 > rank_threshold(A))  # NaN unless positive definite
-    return lapack.lu_factor(_or_identity(A, positive)), positive
+def _by_cholesky(A: Float[Array, "m m"]) -> tuple[Equilibrated, BoolScalar]:
+    size = _size(A)
+    lower = lapack.cholesky(_scaled(size, A) * size[None, :])
+    positive = jnp.all(_diagonal(lower) ** 2 > rank_threshold(A))  # NaN unless positive definite
+    return Equilibrated(size, size, Cholesky(_or_identity(lower, positive))), positive
 
 
-def _equilibrated(A: Float[Array, "m m"]) -> Float[Array, "m m"]:
-    size = jnp.sqrt(jnp.maximum(jnp.abs(jnp.diagonal(A)), jnp.finfo(A.dtype).tiny))
-    return A / size[:, None] / size[None, :]
+def _size(A: Float[Array, "m m"]) -> Float[Array, " m"]:
+    """Return the numbers that scale the diagonal to one, finite whatever the matrix is."""
+    diagonal = jnp.abs(_diagonal(A))
+    usable = (diagonal > 0) & (diagonal < jnp.inf)
+    return jnp.where(usable, 1 / jnp.sqrt(jnp.where(usable, diagonal, 1)), 1)
+
+
+def _diagonal(A: Float[Array, "m m"]) -> Float[Array, " m"]:
+    """Return the diagonal without the indices of `jnp.diagonal`, a tenth of the operations of a correction."""
+    return jnp.sum(jnp.where(np.eye(A.shape[0], dtype=bool), A, 0), axis=1)
 
 
 def _or_identity(A: Float[Array, "m m"], usable: BoolScalar) -> Float[Array, "m m"]:
-    return jnp.where(usable, A, jnp.eye(A.shape[0], dtype=A.dtype))
+    return jnp.where(usable, A, np.eye(A.shape[0], dtype=A.dtype))
 
 
-def _by_library(
-    A: Float[Array, "m m"], lu: tuple[Array, Array], usable: BoolScalar
-) -> Factorization:
-    return Factorization(_or_identity(A, usable), Library(lu), usable, _product)
+def _by_library(A: Float[Array, "m m"], factor: Callable) -> Factorization:
+    factors, usable = factor(jax.lax.stop_gradient(A))
+    return Factorization(_or_identity(A, usable), factors, usable, _product)
 
 
 def gram(A: Float[Array, "i n"], B: Float[Array, "k n"]) -> Float[Array, "i k"]:

@@ -98,6 +98,14 @@ def cholesky(A: Float[Array, "n n"]) -> Float[Array, "n n"]:
     return jnp.linalg.cholesky(A)
 
 
+@_solves_one_after_the_other
+def cholesky_solve(lower: Float[Array, "n n"], b: Float[Array, "n ..."]) -> Float[Array, "n ..."]:
+    """Return the solution of `L L^T x = b`."""
+    columns, options = b.reshape(b.shape[0], -1), dict[str, Any](left_side=True, lower=True)
+    y = jax.lax.linalg.triangular_solve(lower, columns, **options)
+    return jax.lax.linalg.triangular_solve(lower, y, transpose_a=True, **options).reshape(b.shape)
+
+
 @one_after_the_other
 def eigh(A: Float[Array, "n n"]) -> tuple[Float[Array, " n"], Float[Array, "n n"]]:
     return tuple(jnp.linalg.eigh(A, symmetrize_input=False))  # pyright: ignore[reportReturnType]

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float, Inexact
 
 from .._base.types import BoolScalar, FloatScalar
 from . import lapack
-from .dense import Factorization, Library, rank_threshold, UNROLL_LIMIT
+from .dense import Equilibrated, Factorization, Library, rank_threshold, UNROLL_LIMIT
 from .rows import combine, multiply
 
 
@@ -105,20 +105,6 @@ class InverseFactor(eqx.Module):
 
     def solve_transposed(self, b: Float[Array, " n"]) -> Float[Array, " n"]:
         return self.product(self.inverse.T, b)
-
-
-class Equilibrated(eqx.Module):
-    """The factors of `A` after scaling its rows and columns by these numbers."""
-
-    rows: Float[Array, " n"]
-    columns: Float[Array, " n"]
-    factors: InverseFactor | Library
-
-    def solve(self, b: Float[Array, " n"]) -> Float[Array, " n"]:
-        return self.columns * self.factors.solve(self.rows * b)
-
-    def solve_transposed(self, b: Float[Array, " n"]) -> Float[Array, " n"]:
-        return self.rows * self.factors.solve_transposed(self.columns * b)
 
 
 def factorize_equilibrated(A: Float[Array, "n n"]) -> Factorization:

@@ -30,10 +30,12 @@ class Sides(NamedTuple):
 
     def cosine(self, i: int, j: int) -> Float[Array, " k"]:
         """Return the cosine of the angle between axis `i` of the first and axis `j` of the second body."""
-        return dot(self.frame_first[:, :, i], self.frame_second[:, :, j])
+        return dot(
+            jnp.unstack(self.frame_first, axis=2)[i], jnp.unstack(self.frame_second, axis=2)[j]
+        )
 
     def along(self, i: int) -> Float[Array, " k"]:
-        return dot(self.frame_first[:, :, i], self.gap)
+        return dot(jnp.unstack(self.frame_first, axis=2)[i], self.gap)
 
     @property
     def angle(self) -> Float[Array, " k"]:
@@ -64,7 +66,7 @@ class Attachment(eqx.Module):
         """Return the sides with the frames of the bodies to which they belong, `(2, k, ...)`."""
         at = placed.origin + turn(placed.rotation, self.points)
         axes = compose(placed.rotation, self.axes)
-        return Sides(at[0], at[1], axes[0], axes[1])
+        return Sides(*jnp.unstack(at), *jnp.unstack(axes))
 
     def velocities(self, frames: Frames, sides: Sides) -> Vectors:
         """Return the velocities of the second points relative to the first."""

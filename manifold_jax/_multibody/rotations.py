@@ -31,21 +31,62 @@ def _about(axis: Float[Array, "3"], angle: Float[Array, ""]) -> Float[Array, "4"
 
 
 def rotation_matrix(p: Float[Array, "*n 4"]) -> Float[Array, "*n 3 3"]:
-    """Return `R(p)`, which turns vectors of the body to world coordinates; quadratic in `p`."""
-    a, b, c, d = p[..., 0], p[..., 1], p[..., 2], p[..., 3]
-    rows = [
-        [a * a + b * b - c * c - d * d, 2 * (b * c - a * d), 2 * (b * d + a * c)],
-        [2 * (b * c + a * d), a * a - b * b + c * c - d * d, 2 * (c * d - a * b)],
-        [2 * (b * d - a * c), 2 * (c * d + a * b), a * a - b * b - c * c + d * d],
-    ]
-    return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
+    """Return `R(p)`, which turns vectors of the body to world coordinates; quadratic in `p`.
+
+    One product of all `p_k p_l` with a constant matrix: written out, the entries were a third of the operations
+    that a mechanism's program is traced and compiled from.
+    """
+    batch = p.shape[:-1]
+    products = (p[..., :, None] * p[..., None, :]).reshape(*batch, 16)
+    entries = jnp.matmul(products, jnp.asarray(_OF_PRODUCTS, p.dtype), precision="highest")
+    return entries.reshape(*batch, 3, 3)
 
 
 def rates_matrix(p: Float[Array, "*n 4"]) -> Float[Array, "*n 3 4"]:
-    """Return `G(p)`: the angular velocity in the body is `2 G(p) p'`, and `p' = G(p)^T omega / 2`."""
-    a, b, c, d = p[..., 0], p[..., 1], p[..., 2], p[..., 3]
-    rows = [[-b, a, d, -c], [-c, -d, a, b], [-d, c, -b, a]]
-    return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
+    """Return `G(p)`: the angular velocity in the body is `2 G(p) p'`, and `p' = G(p)^T omega / 2`.
+
+    Its rows are `p` with its halves, its pairs, or both exchanged, times signs.
+    """
+    backwards = p[..., ::-1]
+    rows = [_halves_exchanged(backwards), _halves_exchanged(p), backwards]
+    signs = _SIGNS.astype(p.dtype).reshape(*(1,) * (p.ndim - 1), 3, 4)
+    return jnp.stack(rows, axis=-2) * signs
+
+
+def _halves_exchanged(p: Float[Array, "*n 4"]) -> Float[Array, "*n 4"]:
+    return jnp.concatenate([p[..., 2:], p[..., :2]], axis=-1)
+
+
+_SIGNS = np.array([[-1.0, 1.0, 1.0, -1.0], [-1.0, -1.0, 1.0, 1.0], [-1.0, 1.0, -1.0, 1.0]])
+
+
+def _of_products() -> np.ndarray:
+    """Return the matrix that makes the entries of `R(p)` from all `p_k p_l`, shape `(16, 9)`: each entry is
+    `p^T A p` with a symmetric `A`."""
+    a, b, c, d = np.eye(4)
+    product = lambda x, y: (np.outer(x, y) + np.outer(y, x)) / 2
+    square = lambda *signs: np.diag(signs)
+    rows = [
+        [
+            square(1, 1, -1, -1),
+            2 * (product(b, c) - product(a, d)),
+            2 * (product(b, d) + product(a, c)),
+        ],
+        [
+            2 * (product(b, c) + product(a, d)),
+            square(1, -1, 1, -1),
+            2 * (product(c, d) - product(a, b)),
+        ],
+        [
+            2 * (product(b, d) - product(a, c)),
+            2 * (product(c, d) + product(a, b)),
+            square(1, -1, -1, 1),
+        ],
+    ]
+    return np.array(rows, float).reshape(9, 16).T
+
+
+_OF_PRODUCTS = _of_products()
 
 
 @jax.jit
@@ -107,12 +148,15 @@ def compose(R: Float[Array, "*n i j"], S: Float[Array, "*n j k"]) -> Float[Array
 
 def inverted(A: Float[Array, "n 3 3"]) -> tuple[Float[Array, "n 3 3"], BoolScalar]:
     """Return the inverses of symmetric matrices (cofactors), and whether all are positive definite."""
-    next, last = np.array([1, 2, 0]), np.array([2, 0, 1])
-    part = lambda i, j: A[:, i[:, None], j[None, :]]
-    cofactors = part(next, next) * part(last, last) - part(next, last) * part(last, next)
+    after, before = jnp.roll(A, -1, axis=(1, 2)), jnp.roll(A, 1, axis=(1, 2))
+    crossed = jnp.roll(A, (-1, 1), axis=(1, 2)) * jnp.roll(A, (1, -1), axis=(1, 2))
+    cofactors = after * before - crossed
     determinant = jnp.sum(A[:, 0] * cofactors[:, 0], axis=1)
     # the leading minors relative to the size of their terms
-    diagonal, tiny = jnp.diagonal(A, axis1=1, axis2=2), 100 * jnp.finfo(A.dtype).eps
+    diagonal, tiny = (
+        jnp.sum(A * jnp.eye(3, dtype=A.dtype)[None], axis=2),
+        100 * jnp.finfo(A.dtype).eps,
+    )
     second = cofactors[:, 2, 2] > tiny * diagonal[:, 0] * diagonal[:, 1]
     positive = jnp.all(diagonal > 0, axis=1) & second
     positive &= determinant > tiny * jnp.prod(diagonal, axis=1)
