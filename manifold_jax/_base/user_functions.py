@@ -34,15 +34,16 @@ def evaluated(tree: Any, args: Args) -> Any:
 
     The value is closed over, and so is one input, however often the function occurs.
     """
-    found: dict[int, Callable] = {}
+    found: dict[Any, Callable] = {}
 
     def replaced(leaf: Any) -> Any:
         if not isinstance(leaf, AbstractOfArgs):
             return leaf
-        if id(leaf.function) not in found:
+        key = type(leaf), id(leaf.function)
+        if key not in found:
             value = leaf(args)
-            found[id(leaf.function)] = lambda args: value
-        return found[id(leaf.function)]
+            found[key] = lambda args: value
+        return found[key]
 
     return jtu.tree_map(replaced, tree, is_leaf=lambda leaf: isinstance(leaf, AbstractOfArgs))
 

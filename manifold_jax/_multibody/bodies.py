@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from .._base.types import BoolScalar
 from .._mechanics import InvertedBlocks
 from .checks import check_sequence, check_shape, is_concrete, stack, unique_names
 from .rotations import compose, inverted, rates_matrix, turn
@@ -182,7 +183,11 @@ class Bodies(eqx.Module):
             raise ValueError(f"{of}: the ground does not move. Name a body.")
         return i
 
-    def mass_matrix(self, q: Pose) -> Any:
+    def inverse_inertia(self) -> tuple[Float[Array, "n 3 3"], BoolScalar] | None:
+        """Return the inverses, and whether all are positive definite; `None` in the plane."""
+        return None if self.planar else inverted(self.inertia)
+
+    def mass_matrix(self, q: Pose, inverse_inertia: tuple[Array, Array] | None) -> Any:
         """Return a diagonal in the plane; in space the inverses of blocks
         `diag(m, 4 G^T I G + 4 c p p^T)`.
 
@@ -191,11 +196,11 @@ class Bodies(eqx.Module):
         `G` and `p` are orthogonal, of length `|p|`, the inverse of such a block is
         `diag(1/m, (G^T I^-1 G + p p^T / c) / (4 |p|^4))`.
         """
-        if self.planar:
+        if inverse_inertia is None:
             return jnp.stack([self.mass, self.mass, self.inertia], axis=1).reshape(-1)
         p, inertia = q.orientation, self.inertia
         G = rates_matrix(p)
-        inverse, positive = inverted(inertia)
+        inverse, positive = inverse_inertia
         mean = jnp.trace(inertia, axis1=1, axis2=2) / 3
         mean, mass = mean[:, None, None], self.mass[:, None, None]
         along = p[:, :, None] * p[:, None, :]

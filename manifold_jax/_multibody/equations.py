@@ -20,8 +20,17 @@ def _columns(*parts: Float[Array, " k"]) -> Float[Array, "k r"]:
     return jnp.stack(parts, axis=1)
 
 
-def _beside(several: Float[Array, "k r"], *parts: Float[Array, " k"]) -> Float[Array, "k more"]:
-    return jnp.concatenate([several, _columns(*parts)], axis=1)
+def _tilted(s: Sides) -> Float[Array, "k 2"]:
+    """Return the components of `w'` along `u` and `v`."""
+    return turn_back(s.frame_first[:, :, :2], jnp.unstack(s.frame_second, axis=2)[2])
+
+
+def _twisted(s: Sides) -> Float[Array, "k 1"]:
+    return s.cosine(0, 1)[:, None]
+
+
+def _beside(*parts: Float[Array, "k r"]) -> Float[Array, "k more"]:
+    return jnp.concatenate(parts, axis=1)
 
 
 def _gap(s: Sides) -> Float[Array, "k 3"]:
@@ -32,7 +41,7 @@ def _gap(s: Sides) -> Float[Array, "k 3"]:
 
 
 def _cylindrical(s: Sides, length: Any) -> Float[Array, "k 4"]:
-    return _columns(s.along(0), s.along(1), s.cosine(0, 2), s.cosine(1, 2))
+    return _beside(turn_back(s.frame_first[:, :, :2], s.gap), _tilted(s))
 
 
 def _distance(s: Sides, length: Float[Array, " k"]) -> Float[Array, "k 1"]:
@@ -55,19 +64,17 @@ def _driven_angle(s: Sides, target: Float[Array, " k"]) -> Float[Array, "k 1"]:
 
 SPATIAL: dict[type, Callable] = {
     joints.Spherical: lambda s, length: _gap(s),
-    joints.Revolute: lambda s, length: _beside(_gap(s), s.cosine(0, 2), s.cosine(1, 2)),
-    joints.Universal: lambda s, length: _beside(_gap(s), s.cosine(2, 2)),
+    joints.Revolute: lambda s, length: _beside(_gap(s), _tilted(s)),
+    joints.Universal: lambda s, length: _beside(_gap(s), s.cosine(2, 2)[:, None]),
     joints.Cylindrical: _cylindrical,
-    joints.Prismatic: lambda s, length: _beside(_cylindrical(s, length), s.cosine(0, 1)),
-    joints.Fixed: lambda s, length: _beside(
-        _gap(s), s.cosine(0, 2), s.cosine(1, 2), s.cosine(0, 1)
-    ),
+    joints.Prismatic: lambda s, length: _beside(_cylindrical(s, length), _twisted(s)),
+    joints.Fixed: lambda s, length: _beside(_gap(s), _tilted(s), _twisted(s)),
     joints.Distance: _distance,
 }
 PLANAR: dict[type, Callable] = {
     joints.Revolute: lambda s, length: s.gap[:, :2],
     joints.Prismatic: _planar_prismatic,
-    joints.Fixed: lambda s, length: _beside(s.gap[:, :2], s.cosine(0, 1)),
+    joints.Fixed: lambda s, length: _beside(s.gap[:, :2], _twisted(s)),
     joints.Distance: _distance,
 }
 DRIVEN: dict[type, Callable] = {

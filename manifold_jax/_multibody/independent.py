@@ -87,7 +87,7 @@ def _in_drawing(assembly: Any) -> LoopClosure:
 
 def _weighted(bodies: Bodies, J: np.ndarray) -> np.ndarray:
     """Return `J L` with `L L^T = M^-1`."""
-    mass = bodies.mass_matrix(bodies.drawing)
+    mass = bodies.mass_matrix(bodies.drawing, bodies.inverse_inertia())
     if bodies.planar:
         return J / np.sqrt(np.asarray(mass))
     lower = np.linalg.cholesky(np.asarray(mass.inverse))

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._base.types import Args, RealScalarLike
+from .._base.user_functions import AbstractOfArgs
 from .._mechanics import AbstractPositions, MechanicalSystem
 from .bodies import Pose
 from .frames import Frames
@@ -24,11 +25,19 @@ class ConstantAssembly(eqx.Module):
         return self.assembly
 
 
+class _InverseInertia(AbstractOfArgs):
+    function: Callable
+
+    def __call__(self, args: Args) -> Any:
+        return self.function(args).bodies.inverse_inertia()
+
+
 class _Mass(eqx.Module):
     source: Callable
+    inverse_inertia: Callable
 
     def __call__(self, q: Pose, args: Args) -> Any:
-        return self.source(args).bodies.mass_matrix(q)
+        return self.source(args).bodies.mass_matrix(q, self.inverse_inertia(args))
 
 
 class JointEquations(AbstractPositions):
@@ -80,4 +89,5 @@ def system_of(
     source: Callable, redundant: bool, rows: tuple[int, ...] | None = None
 ) -> MechanicalSystem:
     equations = JointEquations(source, rows)
-    return MechanicalSystem(_Mass(source), equations, _Forces(source), redundant=redundant)
+    mass = _Mass(source, _InverseInertia(source))
+    return MechanicalSystem(mass, equations, _Forces(source), redundant=redundant)
