@@ -1,6 +1,7 @@
 """Functions given by users: checked, and evaluated once where they depend on `args` alone."""
 
 import abc
+import dataclasses
 import inspect
 from collections.abc import Callable
 from typing import Any
@@ -41,7 +42,7 @@ def evaluated(tree: Any, args: Args) -> Any:
             return leaf
         key = type(leaf), id(leaf.function)
         if key not in found:
-            value = leaf(args)
+            value = dataclasses.replace(leaf, function=replaced(leaf.function))(args)
             found[key] = lambda args: value
         return found[key]
 

@@ -17,7 +17,7 @@ from jaxtyping import Array, Float, Inexact
 from .._base.derivative_rule import ForwardRule
 from .._base.types import BoolScalar, FloatScalar
 from . import lapack
-from .elimination import eliminate, invert, rank_threshold
+from .elimination import diagonal_of, eliminate, invert, rank_threshold
 
 
 # Number of operations grows like m^3 / 3: 170 at m = 8, still less than one library call.
@@ -162,8 +162,7 @@ def pseudo_invert(A: Float[Array, "m m"], dependent: Any = DEPENDENCE_THRESHOLD)
     matrix is finite, whatever its rank."""
     finite = jnp.all(jnp.isfinite(A))
     A = jnp.where(finite, A, jnp.eye(A.shape[0], dtype=A.dtype))
-    diagonal = jax.lax.stop_gradient(jnp.diagonal(A))
-    size = jnp.where(diagonal > 0, 1 / jnp.sqrt(jnp.where(diagonal > 0, diagonal, 1)), 1)
+    size = _size(jax.lax.stop_gradient(A))
     scale = size[:, None] * size[None, :]
     dependent = jax.lax.stop_gradient(jnp.asarray(dependent, A.dtype))
     return Inverse(scale * _pseudo_inverse(scale * A, dependent), finite, jnp.matmul)
@@ -197,27 +196,22 @@ def factorize_positive(A: Float[Array, "m m"]) -> Factorization:
 def _by_lu(A: Float[Array, "m m"]) -> tuple[Equilibrated, BoolScalar]:
     size = _size(A)
     lu, permutation = lapack.lu_factor(_scaled(size, A) * size[None, :])
-    full_rank = jnp.all(jnp.abs(_diagonal(lu)) > rank_threshold(A))
+    full_rank = jnp.all(jnp.abs(diagonal_of(lu)) > rank_threshold(A))
     return Equilibrated(size, size, Library((_or_identity(lu, full_rank), permutation))), full_rank
 
 
 def _by_cholesky(A: Float[Array, "m m"]) -> tuple[Equilibrated, BoolScalar]:
     size = _size(A)
     lower = lapack.cholesky(_scaled(size, A) * size[None, :])
-    positive = jnp.all(_diagonal(lower) ** 2 > rank_threshold(A))  # NaN unless positive definite
+    positive = jnp.all(diagonal_of(lower) ** 2 > rank_threshold(A))  # NaN unless positive definite
     return Equilibrated(size, size, Cholesky(_or_identity(lower, positive))), positive
 
 
 def _size(A: Float[Array, "m m"]) -> Float[Array, " m"]:
     """Return the numbers that scale the diagonal to one, finite whatever the matrix is."""
-    diagonal = jnp.abs(_diagonal(A))
-    usable = (diagonal > 0) & (diagonal < jnp.inf)
-    return jnp.where(usable, 1 / jnp.sqrt(jnp.where(usable, diagonal, 1)), 1)
-
-
-def _diagonal(A: Float[Array, "m m"]) -> Float[Array, " m"]:
-    """Return the diagonal without the indices of `jnp.diagonal`, a tenth of the operations of a correction."""
-    return jnp.sum(jnp.where(np.eye(A.shape[0], dtype=bool), A, 0), axis=1)
+    entries = jnp.abs(diagonal_of(A))
+    usable = (entries > 0) & (entries < jnp.inf)
+    return jnp.where(usable, 1 / jnp.sqrt(jnp.where(usable, entries, 1)), 1)
 
 
 def _or_identity(A: Float[Array, "m m"], usable: BoolScalar) -> Float[Array, "m m"]:

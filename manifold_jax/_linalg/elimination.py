@@ -59,11 +59,11 @@ class TriangularFactors(eqx.Module):
 
     def solve(self, b: Float[Array, "m ..."]) -> Float[Array, "m ..."]:
         one = jnp.ones(self.lu.shape[0], self.lu.dtype)
-        return _substitute_back(self.lu, _substitute(self.lu, b, one), jnp.diagonal(self.lu))
+        return _substitute_back(self.lu, _substitute(self.lu, b, one), diagonal_of(self.lu))
 
     def solve_transposed(self, b: Float[Array, "m ..."]) -> Float[Array, "m ..."]:
         one = jnp.ones(self.lu.shape[0], self.lu.dtype)
-        return _substitute_back(self.lu.T, _substitute(self.lu.T, b, jnp.diagonal(self.lu)), one)
+        return _substitute_back(self.lu.T, _substitute(self.lu.T, b, diagonal_of(self.lu)), one)
 
 
 def eliminate(A: Float[Array, "m m"]) -> tuple[TriangularFactors | WrittenOut, BoolScalar]:
@@ -87,34 +87,39 @@ def _write_out(A: Float[Array, "m m"]) -> tuple[WrittenOut, BoolScalar]:
 
 
 def _eliminate(A: Float[Array, "m m"]) -> tuple[TriangularFactors, BoolScalar]:
-    rows, smallest = np.arange(A.shape[0]), rank_threshold(A) * jnp.abs(jnp.diagonal(A))
+    rows, smallest = _rows(A), rank_threshold(A) * jnp.abs(diagonal_of(A))
+    nothing = np.zeros(A.shape[0], A.dtype)
 
     def column(k: Any, state: tuple[Array, BoolScalar]) -> tuple[Array, BoolScalar]:
         lu, full_rank = state
-        accepted = lu[k, k] > smallest[k]
-        pivot = jnp.where(accepted, lu[k, k], 1)
-        below = rows > k
-        factors = jnp.where(below, lu[:, k] / pivot, 0)
-        rest = lu - factors[:, None] * jnp.where(below, lu[k], 0)[None, :]
-        new = jnp.where(rows == k, pivot, jnp.where(below, factors, lu[:, k]))
-        return jnp.where((rows == k)[None, :], new[:, None], rest), full_rank & accepted
+        row, own, is_k, below = _entry(lu, k), _entry(lu, k, axis=1), rows == k, rows > k
+        pivot = _entry(row, k)
+        accepted = pivot > _entry(smallest, k)
+        pivot = jnp.where(accepted, pivot, 1)
+        factors = jnp.where(below, own / pivot, nothing)
+        rest = lu - factors[:, None] * jnp.where(below, row, nothing)[None, :]
+        new = jnp.where(is_k, pivot, jnp.where(below, factors, own))
+        return jnp.where(is_k[None, :], new[:, None], rest), full_rank & accepted
 
-    lu, full_rank = _loop(A.shape[0], column, (A, jnp.asarray(True)))
+    lu, full_rank = _loop(rows, column, (A, jnp.asarray(True)))
     return TriangularFactors(lu), full_rank
 
 
 def invert(A: Float[Array, "m m"]) -> tuple[Float[Array, "m m"], BoolScalar]:
     """Return the inverse by Gauss-Jordan elimination, and whether the rank was full, as in `eliminate`."""
-    rows, smallest = np.arange(A.shape[0]), rank_threshold(A) * jnp.abs(jnp.diagonal(A))
+    rows, smallest = _rows(A), rank_threshold(A) * jnp.abs(diagonal_of(A))
+    one, nothing = np.ones(A.shape[0], A.dtype), np.zeros(A.shape, A.dtype)
 
     def column(k: Any, state: tuple[Array, BoolScalar]) -> tuple[Array, BoolScalar]:
         A, full_rank = state
-        accepted = A[k, k] > smallest[k]
-        row = jnp.where(rows == k, 1, A[k]) / jnp.where(accepted, A[k, k], 1)
-        others = jnp.where((rows == k)[None, :], 0, A) - A[:, k][:, None] * row[None, :]
-        return jnp.where((rows == k)[:, None], row[None, :], others), full_rank & accepted
+        row, is_k = _entry(A, k), rows == k
+        pivot = _entry(row, k)
+        accepted = pivot > _entry(smallest, k)
+        row = jnp.where(is_k, one, row) / jnp.where(accepted, pivot, 1)
+        others = jnp.where(is_k[None, :], nothing, A) - _entry(A, k, axis=1)[:, None] * row[None, :]
+        return jnp.where(is_k[:, None], row[None, :], others), full_rank & accepted
 
-    return _loop(A.shape[0], column, (A, jnp.asarray(True)))
+    return _loop(rows, column, (A, jnp.asarray(True)))
 
 
 def rank_threshold(A: Float[Array, "m m"]) -> float:
@@ -122,38 +127,54 @@ def rank_threshold(A: Float[Array, "m m"]) -> float:
     return 10 * A.shape[0] * float(jnp.finfo(A.dtype).eps)
 
 
+def diagonal_of(A: Float[Array, "m m"]) -> Float[Array, " m"]:
+    """Return the diagonal of a small matrix in three operations, where `jnp.diagonal` needs fifteen."""
+    return jnp.sum(jnp.where(np.eye(A.shape[0], dtype=bool), A, np.zeros(A.shape, A.dtype)), axis=1)
+
+
 def _substitute(
     M: Float[Array, "m m"], b: Float[Array, "m ..."], diagonal: Float[Array, " m"]
 ) -> Float[Array, "m ..."]:
     """Solve `L x = b`, with `L` the part of `M` below the diagonal and this diagonal."""
-    rows = np.arange(M.shape[0])
-    return _loop(
-        M.shape[0], lambda k, x: _subtracted(x, k, jnp.where(rows > k, M[:, k], 0), diagonal), b
-    )
+    rows, nothing = _rows(M), np.zeros(M.shape[0], M.dtype)
+
+    def column(k: Any, x: Array) -> Array:
+        below = jnp.where(rows > k, _entry(M, k, axis=1), nothing)
+        return _subtracted(x, k, rows == k, below, diagonal)
+
+    return _loop(rows, column, b)
 
 
 def _substitute_back(
     M: Float[Array, "m m"], b: Float[Array, "m ..."], diagonal: Float[Array, " m"]
 ) -> Float[Array, "m ..."]:
     """Solve `U x = b`, with `U` the part of `M` above the diagonal and this diagonal."""
-    rows, last = np.arange(M.shape[0]), M.shape[0] - 1
+    rows, nothing = _rows(M), np.zeros(M.shape[0], M.dtype)
 
-    def column(j: Any, x: Array) -> Array:
-        k = last - j
-        return _subtracted(x, k, jnp.where(rows < k, M[:, k], 0), diagonal)
+    def column(k: Any, x: Array) -> Array:
+        above = jnp.where(rows < k, _entry(M, k, axis=1), nothing)
+        return _subtracted(x, k, rows == k, above, diagonal)
 
-    return _loop(M.shape[0], column, b)
+    return _loop(rows[::-1], column, b)
 
 
 def _subtracted(
-    x: Array, k: Any, column: Float[Array, " m"], diagonal: Float[Array, " m"]
+    x: Array, k: Any, is_k: Array, column: Float[Array, " m"], diagonal: Float[Array, " m"]
 ) -> Array:
     """Return `x` with unknown `k` in its place, and its column subtracted from the other equations."""
     along = lambda v: v.reshape(len(v), *(1,) * (x.ndim - 1))
-    found = x[k] / diagonal[k]
-    is_k = along(np.arange(len(diagonal)) == k)
-    return jnp.where(is_k, found[None], x - along(column) * found[None])
+    found = _entry(x, k) / _entry(diagonal, k)
+    return jnp.where(along(is_k), found[None], x - along(column) * found[None])
 
 
-def _loop(m: int, body: Callable[[Any, Any], Any], start: Any) -> Any:
-    return jax.lax.fori_loop(0, m, body, start)
+def _entry(x: Array, k: Any, axis: int = 0) -> Array:
+    """Return entry, row or column `k`. (Of `x[k]` six operations would be for negative numbers.)"""
+    return jax.lax.dynamic_index_in_dim(x, k, axis, keepdims=False, allow_negative_indices=False)
+
+
+def _rows(A: Array) -> np.ndarray:
+    return np.arange(A.shape[0], dtype=np.int32)
+
+
+def _loop(rows: np.ndarray, body: Callable[[Any, Any], Any], start: Any) -> Any:
+    return jax.lax.scan(lambda state, k: (body(k, state), None), start, rows)[0]

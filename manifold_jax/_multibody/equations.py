@@ -29,7 +29,7 @@ def _twisted(s: Sides) -> Float[Array, "k 1"]:
     return s.cosine(0, 1)[:, None]
 
 
-def _beside(*parts: Float[Array, "k r"]) -> Float[Array, "k more"]:
+def _beside(*parts: Float[Array, "k _"]) -> Float[Array, "k more"]:
     return jnp.concatenate(parts, axis=1)
 
 
