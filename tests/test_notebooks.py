@@ -11,10 +11,10 @@ from optimized import MEDIUM_FLAGS
 NOTEBOOKS = sorted(Path(__file__).parents[1].glob("notebooks/*.ipynb"))
 
 # They compile for long and run shortly, so that the flags of the tests, without optimization, take half the time.
-COMPILED_FOR_LONG = ("08_from", "13_from", "14_the")
+COMPILED_FOR_LONG = ("08_from", "13_from", "14_the", "16_a")
 
 # They run for long, too: the flags between those of the tests and those of a reader.
-COMPILED_AND_RUN_FOR_LONG = ("04", "05", "06", "07", "09", "10", "11", "12", "15", "16")
+COMPILED_AND_RUN_FOR_LONG = ("04", "05", "06", "07", "09", "10", "11", "12", "15")
 
 notebooks = pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 
