@@ -63,27 +63,19 @@ _SIGNS = np.array([[-1.0, 1.0, 1.0, -1.0], [-1.0, -1.0, 1.0, 1.0], [-1.0, 1.0, -
 def _of_products() -> np.ndarray:
     """Return the matrix that makes the entries of `R(p)` from all `p_k p_l`, shape `(16, 9)`: each entry is
     `p^T A p` with a symmetric `A`."""
-    a, b, c, d = np.eye(4)
-    product = lambda x, y: (np.outer(x, y) + np.outer(y, x)) / 2
-    square = lambda *signs: np.diag(signs)
-    rows = [
-        [
-            square(1, 1, -1, -1),
-            2 * (product(b, c) - product(a, d)),
-            2 * (product(b, d) + product(a, c)),
-        ],
-        [
-            2 * (product(b, c) + product(a, d)),
-            square(1, -1, 1, -1),
-            2 * (product(c, d) - product(a, b)),
-        ],
-        [
-            2 * (product(b, d) - product(a, c)),
-            2 * (product(c, d) + product(a, b)),
-            square(1, -1, -1, 1),
-        ],
-    ]
-    return np.array(rows, float).reshape(9, 16).T
+
+    def rotation(p: np.ndarray) -> np.ndarray:
+        a, b, c, d = p
+        rows = [
+            [a * a + b * b - c * c - d * d, 2 * (b * c - a * d), 2 * (b * d + a * c)],
+            [2 * (b * c + a * d), a * a - b * b + c * c - d * d, 2 * (c * d - a * b)],
+            [2 * (b * d - a * c), 2 * (c * d + a * b), a * a - b * b - c * c + d * d],
+        ]
+        return np.array(rows)
+
+    units = np.eye(4)
+    found = [rotation(p + r) - rotation(p) - rotation(r) for p in units for r in units]
+    return np.array(found).reshape(16, 9) / 2
 
 
 _OF_PRODUCTS = _of_products()
@@ -153,10 +145,8 @@ def inverted(A: Float[Array, "n 3 3"]) -> tuple[Float[Array, "n 3 3"], BoolScala
     cofactors = after * before - crossed
     determinant = jnp.sum(A[:, 0] * cofactors[:, 0], axis=1)
     # the leading minors relative to the size of their terms
-    diagonal, tiny = (
-        jnp.sum(A * jnp.eye(3, dtype=A.dtype)[None], axis=2),
-        100 * jnp.finfo(A.dtype).eps,
-    )
+    tiny = 100 * jnp.finfo(A.dtype).eps
+    diagonal = jnp.sum(A * jnp.eye(3, dtype=A.dtype)[None], axis=2)
     second = cofactors[:, 2, 2] > tiny * diagonal[:, 0] * diagonal[:, 1]
     positive = jnp.all(diagonal > 0, axis=1) & second
     positive &= determinant > tiny * jnp.prod(diagonal, axis=1)
