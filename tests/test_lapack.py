@@ -51,6 +51,44 @@ def test_batches_of_systems(factor):
     assert not batched_calls(every, POSITIVE, RIGHT)
 
 
+@pytest.mark.parametrize("factor", [factorize, factorize_positive])
+def test_units_of_equations_do_not_matter(factor):
+    A, size = POSITIVE[0, 0], 10.0 ** np.linspace(-9, 9, N)
+    scaled = size[:, None] * A * size[None, :]
+    x, usable = jax.jit(lambda A, b: (factor(A).solve(b), factor(A).usable))(scaled, RIGHT[0])
+    assert usable
+    np.testing.assert_allclose(x * size, np.linalg.solve(A, RIGHT[0] / size), rtol=1e-9)
+
+
+DEPENDENT = POSITIVE[0, 0].copy()
+DEPENDENT[:, 4], DEPENDENT[4] = DEPENDENT[:, 2], DEPENDENT[2]
+DEPENDENT[4, 4] = DEPENDENT[2, 2]
+FAULTS = {"dependent": DEPENDENT, "zero": np.zeros((N, N)), "NaN": np.full((N, N), np.nan)}
+FAULTS["infinite"] = np.where(np.eye(N) > 0, np.inf, POSITIVE[0, 0])
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+@pytest.mark.parametrize("factor", [factorize, factorize_positive])
+def test_what_cannot_be_solved_is_told_and_finite(factor, fault):
+    """Also in derivatives: those of a rejected step are multiplied by zero."""
+
+    def solve(A):
+        factors = factor(A)
+        return factors.solve(jnp.asarray(RIGHT[0])), factors.usable
+
+    (x, usable), pull = jax.vjp(solve, jnp.asarray(FAULTS[fault]))
+    assert not usable
+    assert np.isfinite(x).all()
+    (A_bar,) = pull((jnp.ones(N), np.zeros((), jax.dtypes.float0)))
+    assert np.isfinite(A_bar).all()
+
+
+def test_indefinite_matrices_are_not_positive():
+    indefinite = jnp.asarray(POSITIVE[0, 0] - 3 * np.diag(np.diag(POSITIVE[0, 0])))
+    assert factorize(indefinite).usable
+    assert not factorize_positive(indefinite).usable
+
+
 @pytest.mark.parametrize("factor", [factorize, factorize_pivoted])
 def test_many_right_hand_sides_of_one_matrix(factor):
     """They are solved for at once, also within a batch of matrices: no loop over them, no copies of the factors."""

@@ -196,14 +196,16 @@ def factorize_positive(A: Float[Array, "m m"]) -> Factorization:
 def _by_lu(A: Float[Array, "m m"]) -> tuple[Equilibrated, BoolScalar]:
     size = _size(A)
     lu, permutation = lapack.lu_factor(_scaled(size, A) * size[None, :])
-    full_rank = jnp.all(jnp.abs(diagonal_of(lu)) > rank_threshold(A))
+    pivots = jnp.abs(diagonal_of(lu))
+    full_rank = jnp.all((pivots > rank_threshold(A)) & (pivots < jnp.inf))
     return Equilibrated(size, size, Library((_or_identity(lu, full_rank), permutation))), full_rank
 
 
 def _by_cholesky(A: Float[Array, "m m"]) -> tuple[Equilibrated, BoolScalar]:
     size = _size(A)
     lower = lapack.cholesky(_scaled(size, A) * size[None, :])
-    positive = jnp.all(diagonal_of(lower) ** 2 > rank_threshold(A))  # NaN unless positive definite
+    pivots = diagonal_of(lower) ** 2  # NaN unless positive definite
+    positive = jnp.all((pivots > rank_threshold(A)) & (pivots < jnp.inf))
     return Equilibrated(size, size, Cholesky(_or_identity(lower, positive))), positive
 
 
