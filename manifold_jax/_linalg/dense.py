@@ -52,6 +52,12 @@ class Library(eqx.Module):
 
     lu: tuple[Inexact[Array, "m m"], Array]
 
+    @staticmethod
+    def where(usable: BoolScalar, lu: Inexact[Array, "m m"], permutation: Array) -> "Library":
+        """Return these factors, or those of the identity."""
+        unchanged = np.arange(lu.shape[0], dtype=permutation.dtype)
+        return Library((_or_identity(lu, usable), jnp.where(usable, permutation, unchanged)))
+
     def solve(self, b: Inexact[Array, "m ..."]) -> Inexact[Array, "m ..."]:
         return lapack.lu_solve(*self.lu, b)
 
@@ -198,7 +204,7 @@ def _by_lu(A: Float[Array, "m m"]) -> tuple[Equilibrated, BoolScalar]:
     lu, permutation = lapack.lu_factor(_scaled(size, A) * size[None, :])
     pivots = jnp.abs(diagonal_of(lu))
     full_rank = jnp.all((pivots > rank_threshold(A)) & (pivots < jnp.inf))
-    return Equilibrated(size, size, Library((_or_identity(lu, full_rank), permutation))), full_rank
+    return Equilibrated(size, size, Library.where(full_rank, lu, permutation)), full_rank
 
 
 def _by_cholesky(A: Float[Array, "m m"]) -> tuple[Equilibrated, BoolScalar]:
@@ -210,13 +216,14 @@ def _by_cholesky(A: Float[Array, "m m"]) -> tuple[Equilibrated, BoolScalar]:
 
 
 def _size(A: Float[Array, "m m"]) -> Float[Array, " m"]:
-    """Return the numbers that scale the diagonal to one, finite whatever the matrix is."""
+    """Return the numbers by which rows and columns are multiplied for a diagonal of ones; finite whatever the
+    matrix is."""
     entries = jnp.abs(diagonal_of(A))
     usable = (entries > 0) & (entries < jnp.inf)
     return jnp.where(usable, 1 / jnp.sqrt(jnp.where(usable, entries, 1)), 1)
 
 
-def _or_identity(A: Float[Array, "m m"], usable: BoolScalar) -> Float[Array, "m m"]:
+def _or_identity(A: Inexact[Array, "m m"], usable: BoolScalar) -> Inexact[Array, "m m"]:
     return jnp.where(usable, A, np.eye(A.shape[0], dtype=A.dtype))
 
 

@@ -60,11 +60,7 @@ def factorize_pivoted(
 def _lapack(A: Inexact[Array, "n n"]) -> tuple[Library, BoolScalar]:
     lu, permutation = lapack.lu_factor(A)
     nonsingular = jnp.all(jnp.isfinite(lu)) & jnp.all(jnp.diagonal(lu) != 0)
-    lu = jnp.where(nonsingular, lu, jnp.eye(A.shape[0], dtype=A.dtype))
-    permutation = jnp.where(
-        nonsingular, permutation, jnp.arange(A.shape[0], dtype=permutation.dtype)
-    )
-    return Library((lu, permutation)), nonsingular
+    return Library.where(nonsingular, lu, permutation), nonsingular
 
 
 def _eliminate(A: Inexact[Array, "n n"]) -> tuple[UnrolledElimination, BoolScalar]:

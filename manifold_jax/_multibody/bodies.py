@@ -194,7 +194,7 @@ class Bodies(eqx.Module):
         The last term has no effect, as the norm of `p` is constant, and makes the matrix nonsingular:
         without it no force is needed to stretch a quaternion. `c` is the mean moment. As the rows of
         `G` and `p` are orthogonal, of length `|p|`, the inverse of such a block is
-        `diag(1/m, (G^T I^-1 G + p p^T / c) / (4 |p|^4))`.
+        `diag(1/m, (G^T I^-1 G + p p^T / c) / (4 |p|^4))`. `inverse_inertia` is what the method of that name returns.
         """
         if inverse_inertia is None:
             return jnp.stack([self.mass, self.mass, self.inertia], axis=1).reshape(-1)

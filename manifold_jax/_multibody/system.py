@@ -26,7 +26,9 @@ class ConstantAssembly(eqx.Module):
 
 
 class _InverseInertia(AbstractOfArgs):
-    function: Callable
+    """Computed once in a solve, not in every evaluation."""
+
+    function: Callable  # returns the assembly
 
     def __call__(self, args: Args) -> Any:
         return self.function(args).bodies.inverse_inertia()
