@@ -24,6 +24,8 @@ from ._multibody import (
     read_urdf as read_urdf,
     Revolute as Revolute,
     Robot as Robot,
+    RotationalDamper as RotationalDamper,
+    RotorInertia as RotorInertia,
     Spherical as Spherical,
     Spring as Spring,
     state_of_mujoco as state_of_mujoco,

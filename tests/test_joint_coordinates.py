@@ -53,7 +53,7 @@ def every_joint():
     return mb.Assembly(bodies, joints, forces, gravity=GRAVITY)
 
 
-def in_the_plane(damping=0.4):
+def in_the_plane(damping=0.4, rotors=()):
     """A slider-crank whose slider is the first body of its joint, and a body that moves freely on a damper."""
     bodies = [
         mb.Body("crank", 1.0, 0.1, position=(0.3, 0.1), orientation=0.4),
@@ -69,7 +69,7 @@ def in_the_plane(damping=0.4):
         mb.Distance("weight", "crank", between=((0.1, -0.9), (0.4, 0.0))),
     ]
     forces = [mb.Damper("weight", "rod", between=((0.0, -1.0), (1.0, 0.3)), damping=damping)]
-    return mb.Assembly(bodies, joints, forces, gravity=(0.2, -9.81))
+    return mb.Assembly(bodies, joints, [*forces, *rotors], gravity=(0.2, -9.81))
 
 
 MECHANISMS = {"in space": every_joint, "in the plane": in_the_plane}
@@ -165,7 +165,7 @@ def test_a_solve_stays_on_the_manifold_and_keeps_the_energy():
     assert np.ptp(energy.kinetic) > 1
 
 
-def chain(mass=0.7, length=0.8):
+def chain(mass=0.7, length=0.8, rotors=()):
     """A double pendulum in space with a hinge and a slider: no loops."""
     bodies = [
         mb.Body("upper", 1.0, (0.1, 0.1, 0.01), position=(0, 0, -0.5)),
@@ -175,7 +175,7 @@ def chain(mass=0.7, length=0.8):
         mb.Revolute(mb.GROUND, "upper", points=((0, 0, 0), (0, 0, 0.5)), axis=(0, 1, 0)),
         mb.Prismatic("upper", "lower", points=((0, 0, -length), (0, 0, 0.2)), axis=(0.3, 0, 1)),
     ]
-    return mb.Assembly(bodies, joints, gravity=GRAVITY)
+    return mb.Assembly(bodies, joints, rotors, gravity=GRAVITY)
 
 
 def test_trees_have_no_constraint():
@@ -233,6 +233,87 @@ def test_dependent_equations_of_loops_are_left_out():
     hinged = joints.assembly.system
     expected = eqx.filter_jit(hinged.accelerations)(0.0, joints.poses(y)).coordinates
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-11 * np.abs(expected).max())
+
+
+def accelerations_of_lagrange(joints, y):
+    """From the energies of the assembly: `d/dt dT/dv - d(T - V)/dq = J^T lambda`, in NumPy at the end."""
+    energy = lambda q, v: joints.assembly.energy(joints.poses((q, v)))
+    kinetic = lambda q, v: energy(q, v).kinetic
+    lagrangian = lambda q, v: energy(q, v).kinetic - energy(q, v).potential
+    (q, v), equations = y, joints.system.holonomic
+    along = lambda f: jax.jvp(f, (q,), (v,))[1]
+
+    @jax.jit
+    def parts():
+        momentum = lambda q: jax.grad(kinetic, 1)(q, v)
+        rows = lambda q: jax.jacfwd(lambda q: equations(0.0, q, None))(q)
+        M = jax.hessian(kinetic, 1)(q, v)
+        return M, jax.grad(lagrangian)(q, v) - along(momentum), rows(q), -along(rows) @ v
+
+    M, force, J, bias = map(np.asarray, parts())
+    m = len(bias)
+    whole = np.block([[M, J.T], [J, np.zeros((m, m))]])
+    return np.linalg.solve(whole, np.concatenate([force, bias]))[: len(force)]
+
+
+ROTORS = {"Revolute crank-ground": 0.7, "Revolute slider-rod": 0.4, "guide": 3.0}
+
+
+def test_rotors():
+    """In joints of a loop, also where the first body of a joint is the child, and one that closes the loop
+    without them."""
+    rotors = [mb.RotorInertia(joint, value) for joint, value in ROTORS.items()]
+    assembly = in_the_plane(damping=0.0, rotors=rotors)
+    bare = mb.JointCoordinates(in_the_plane(damping=0.0))
+    joints = mb.JointCoordinates(assembly)
+    assert set(ROTORS) <= set(joints.names)
+    assert not set(ROTORS) <= set(bare.names)
+    y = perturbed(joints, joints.state(moving(assembly)))
+    found = eqx.filter_jit(joints.system.accelerations)(0.0, y)
+    np.testing.assert_allclose(found, accelerations_of_lagrange(joints, y), rtol=1e-11)
+    poses = eqx.filter_jit(joints.poses)(y)
+    without = eqx.filter_jit(bare.system.accelerations)(0.0, bare.state(poses))
+    shared = [name for name in bare.names if name in joints.names]
+    pick = lambda names, a: np.asarray(a)[[names.index(name) for name in shared]]
+    change = pick(joints.names, found) - pick(bare.names, without)
+    assert np.abs(change).max() > 0.1 * np.abs(found).max()
+
+
+def test_gradients_by_the_inertia_of_rotors():
+    """A hinge and a slider without loops, by inertia: forward = reverse = differences; vmapped = single."""
+
+    def size(inertia):
+        names = "Revolute ground-upper", "Prismatic upper-lower"
+        joints = mb.JointCoordinates(chain(rotors=list(map(mb.RotorInertia, names, inertia))))
+        y = (jnp.array([0.4, 0.1]), jnp.array([1.0, -0.5]))
+        return jnp.sum(joints.terms.vf(0.0, y, None)[1] ** 2)
+
+    at, h = jnp.array([0.3, 0.5]), 1e-4
+    value, reverse = jax.jit(jax.value_and_grad(size))(at)
+    np.testing.assert_allclose(reverse, jax.jit(jax.jacfwd(size))(at), rtol=1e-12)
+    moved = at[None] + h * jnp.array([[0.0, 0.0], [1, 0], [-1, 0], [0, 1], [0, -1]])
+    values = jax.jit(jax.vmap(size))(moved)
+    np.testing.assert_allclose(reverse, (values[1::2] - values[2::2]) / (2 * h), rtol=1e-6)
+    np.testing.assert_allclose(values[0], value, rtol=1e-13)
+
+
+def test_messages_of_rotors(as_a_user_meets_it):
+    rotors = [mb.RotorInertia("Revolute ground-upper", 0.1)]
+    with pytest.raises(ValueError, match=r"couples bodies.*\n?.*`mj.multibody.JointCoordinates"):
+        chain(rotors=rotors).system  # noqa: B018
+    system = mb.parametrized(lambda args: chain(rotors=rotors))
+    with pytest.raises(ValueError, match="couples bodies"):
+        system.terms.vf(0.0, chain().state(assemble=True), None)
+    everywhere = [*ROTORS, "Revolute crank-rod"]
+    assembly = in_the_plane(rotors=[mb.RotorInertia(joint, 1.0) for joint in everywhere])
+    with pytest.raises(ValueError, match="joints with `RotorInertia` form a closed loop"):
+        mb.JointCoordinates(assembly)
+    with pytest.raises(ValueError, match="`inertia` must not be negative, got -1"):
+        chain(rotors=[mb.RotorInertia("Prismatic upper-lower", -1.0)])
+    with pytest.raises(ValueError, match="names the joint 'elbow', which is not there"):
+        chain(rotors=[mb.RotorInertia("elbow", 1.0)])
+    with pytest.raises(ValueError, match=r"a Distance, .*Rotors belong to `Revolute`"):
+        in_the_plane(rotors=[mb.RotorInertia("Distance weight-crank", 1.0)])
 
 
 def test_single_precision_stays_single(case):

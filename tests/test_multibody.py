@@ -492,6 +492,19 @@ def test_points_of_springs_that_coincide(spring, expected):
         np.testing.assert_array_equal(slope.coordinates, 0)
 
 
+def test_a_rotational_damper_is_the_damping_of_a_hinge():
+    hinge = mb.Revolute("b", "a", at=(0, 0, 0), axis=(1.0, 2.0, 0.5), name="hinge")
+    damped = mb.RotationalDamper("b", "a", 0.7), mb.JointSpring("hinge", damping=0.7)
+    robots = [mb.Assembly([A, B], [hinge], [damper]) for damper in damped]
+    y = robots[0].state(None, None, None, {"a": (2.0, 4.0, 1.0)}, assemble=True)
+    found, expected = (accelerations(robot.system, y).coordinates for robot in robots)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-14)
+    assert (
+        np.abs(found - accelerations(mb.Assembly([A, B], [hinge]).system, y).coordinates).max()
+        > 0.1
+    )
+
+
 def test_states_of_single_precision():
     """Large mechanisms are closed to rounding."""
     with jax.enable_x64(False):
@@ -567,6 +580,7 @@ A, B = spatial("a"), spatial("b")
         (lambda: force(mb.Spring("a", "b", np.nan, between=((0, 0, 0), (1, 0, 0)))), "`stiffness` must be finite"),
         (lambda: force(mb.LinearActuator("a", "b", None, ((0, 0, 0), (1, 0, 0)))), "`value` must be a number, got None"),
         (lambda: force(mb.Force("a", (1.0, 2.0))), r"`value` must be of shape \(3,\), got shape \(2,\)"),
+        (lambda: force(mb.RotationalDamper("a", "a", 1.0)), "connects 'a' with itself"),
         (lambda: force(mb.Torque(mb.GROUND, (0, 0, 1))), "the ground does not move"),
         (lambda: joint(mb.Spherical("a", "b", at=(0, 0, 0))).state(None, {"a": (2, 0, 0, 0)}), "`orientations` of 'a' must be a quaternion of norm 1"),
         (lambda: mb.Assembly([mb.Body("p", 1.0, 1.0)], [mb.Revolute("p", "ground", at=(0, 0))]).state(None, None, None, {"p": (0, 0, 1)}), "`angular_velocities` of 'p' must be a number"),

@@ -36,7 +36,8 @@ def those_of_mujoco(robot, model, data):
 class RandomTree:
     """MJCF of a tree with every joint that is read, in random places."""
 
-    def __init__(self, seed):
+    def __init__(self, seed, armature=False):  # and damped ball joints
+        self.armature = armature
         self.rng = np.random.default_rng(seed)
         types = ["hinge", "slide", "ball", "universal", "cylindrical", "none"]
         self.types = [str(t) for t in self.rng.permutation(types)] + ["free", "hinge"]
@@ -53,6 +54,8 @@ class RandomTree:
         if kind in ("hinge", "slide"):
             spring = f'stiffness="{self.positive(0, 2)}" springref="{self.positive(-0.3, 0.3)}"'
             spring += f' damping="{self.positive(0, 0.5)}"'
+            if self.armature:
+                spring += f' armature="{self.positive(0.5, 2)}"'
             axis = self.numbers()
             return f'<joint name="j{i}" type="{kind}" pos="{at}" axis="{axis}" {spring}/>'
         if kind == "universal":
@@ -63,7 +66,12 @@ class RandomTree:
             axis = self.numbers()
             slide = f'<joint type="slide" axis="{axis}"/>'
             return slide + f'<joint type="hinge" pos="{at}" axis="{axis}"/>'
-        others = {"ball": f'<joint type="ball" pos="{at}"/>', "free": "<freejoint/>", "none": ""}
+        damping = f'damping="{self.positive(0.5, 2)}"' if self.armature else ""
+        others = {
+            "ball": f'<joint type="ball" pos="{at}" {damping}/>',
+            "free": "<freejoint/>",
+            "none": "",
+        }
         return others[kind]
 
     def body(self, i):
@@ -90,9 +98,23 @@ class RandomTree:
         )
 
 
-@pytest.mark.parametrize("seed", [0, 1])
-def test_accelerations_of_random_trees(seed):
-    tree = RandomTree(seed)
+@eqx.filter_jit
+def accelerations_by_joints(robot, y, args):
+    joints = mb.JointCoordinates(robot)
+    q, v = joints.state(y)
+    ahead = v, joints.system.accelerations(0.0, (q, v), args)
+
+    def rates(y):
+        poses = joints.poses(y)
+        spins = [robot.motion(poses, name).angular_velocity for name in robot.names]
+        return poses[1].position, jnp.stack(spins)
+
+    return eqx.filter_jvp(rates, ((q, v),), (ahead,))[1]
+
+
+@pytest.mark.parametrize(("seed", "armature"), [(0, False), (1, False), (2, True)])
+def test_accelerations_of_random_trees(seed, armature):
+    tree = RandomTree(seed, armature)
     model = mujoco.MjModel.from_xml_string(tree.xml())
     robot = mb.from_mujoco(model, control=lambda t, args: args)
     data = mujoco.MjData(model)
@@ -103,7 +125,8 @@ def test_accelerations_of_random_trees(seed):
     y = mb.state_of_mujoco(robot, model, data)
     gaps = robot.gaps(y[0]).values()
     assert max(np.abs(gap).max() for gap in gaps) < 1e-14
-    actual = accelerations(robot, y, jnp.asarray(data.ctrl))
+    solved = accelerations_by_joints if armature else accelerations
+    actual = solved(robot, y, jnp.asarray(data.ctrl))
     for ours, theirs in zip(actual, those_of_mujoco(robot, model, data)):
         assert np.abs(theirs).max() > 1
         np.testing.assert_allclose(ours, theirs, rtol=0, atol=1e-11)
@@ -177,8 +200,11 @@ QUIET = 'contype="0"'
     [
         (('<joint name="j" range="-1 1" limited="true"/>', QUIET, "", ""), "joint limit: j"),
         (('<joint name="j" frictionloss="1"/>', QUIET, "", ""), "friction loss: j"),
-        (('<joint name="j" armature="1"/>', QUIET, "", ""), "armature: j"),
-        (('<joint name="j" type="ball" damping="1"/>', QUIET, "", ""), "damping of several .*: j"),
+        (
+            ('<joint name="j" type="ball" armature="1"/>', QUIET, "", ""),
+            "armature of several coordinates: j",
+        ),
+        (('<joint name="j" type="ball" stiffness="1"/>', QUIET, "", ""), "stiffness of several .*: j"),
         ((FREE, "", '<geom name="floor" type="plane" size="1 1 1"/>', ""), "contact: .*ball"),
         (
             (FREE, QUIET, "", '<tendon><fixed name="rope"><joint joint="j" coef="1"/></fixed></tendon>'),

@@ -10,6 +10,8 @@ from .forces import (
     JointSpring as JointSpring,
     LinearActuator as LinearActuator,
     Motor as Motor,
+    RotationalDamper as RotationalDamper,
+    RotorInertia as RotorInertia,
     Spring as Spring,
     Torque as Torque,
 )

@@ -15,16 +15,18 @@ from .._mechanics import MechanicalSystem
 from .bodies import Bodies, Body, Pose
 from .checks import check_shape, floating, is_concrete
 from .equations import DRIVEN
+from .force_groups import group_forces
 from .forces import AbstractForce
 from .frames import Frames, in_space, Placed, with_ground
 from .independent import find_independent, Independent
 from .joint_forces import find_joint_forces
 from .joint_groups import group_restraints, JointGroup, residuals
 from .joints import AbstractRestraint, Revolute
-from .loads import AbstractLoads, group_forces
+from .loads import AbstractLoads
 from .picture import draw_outline, new_axes, outline_of, write_film
 from .reading import Energy, JointForce, Motion, over_times, Times
 from .rotations import rates_matrix, turn
+from .rotors import group_rotors, refuse_rotors, Rotors
 from .start import make_state
 from .system import ConstantAssembly, system_of
 
@@ -46,8 +48,8 @@ class Assembly(eqx.Module):
     - `bodies`: [`Body`][], in any order. `joints`: [`Revolute`][], [`Spherical`][],
         [`Prismatic`][], [`Cylindrical`][], [`Universal`][], [`Fixed`][], [`Distance`][], and [`Drive`][]
         where their motion is prescribed.
-    - `forces`: [`Spring`][], [`Damper`][], [`JointSpring`][], [`Motor`][],
-        [`LinearActuator`][], [`Controller`][], [`Force`][], [`Torque`][].
+    - `forces`: [`Spring`][], [`Damper`][], [`RotationalDamper`][], [`JointSpring`][], [`Motor`][],
+        [`LinearActuator`][], [`Controller`][], [`Force`][], [`Torque`][], and [`RotorInertia`][].
     - `gravity` (m/s^2): shape `(2,)` or `(3,)`; `None` for none.
     - `redundant`: whether equations of joints depend on each other, as in most closed loops in
         space that move in a plane. `Assembly.state` says so.
@@ -66,6 +68,7 @@ class Assembly(eqx.Module):
     bodies: Bodies
     joints: tuple[JointGroup, ...]
     loads: tuple[AbstractLoads, ...]
+    rotors: tuple[Rotors, ...]
     gravity: Float[Array, "3"]
     redundant: bool = eqx.field(static=True)
     independent: Independent | None
@@ -83,6 +86,7 @@ class Assembly(eqx.Module):
         d = 2 if self.bodies.planar else 3
         self.joints = group_restraints(self.bodies, joints)
         self.loads = group_forces(self.bodies, self.joints, forces)
+        self.rotors = group_rotors(self.joints, forces)
         gravity = np.zeros(d) if gravity is None else gravity
         self.gravity = in_space(check_shape("`gravity`", gravity, (d,)))
         self.redundant = redundant
@@ -96,7 +100,10 @@ class Assembly(eqx.Module):
     @property
     def system(self) -> MechanicalSystem:
         """Masses, constraints and forces as a [`MechanicalSystem`][], which has the `terms`, the
-        manifold `constraint` and the `multipliers`."""
+        manifold `constraint` and the `multipliers`.
+
+        **Raises** `ValueError` for [`RotorInertia`][]: use [`JointCoordinates`][]."""
+        refuse_rotors(self.rotors)
         rows = None if self.independent is None else self.independent.rows
         return system_of(ConstantAssembly(self), self.redundant and rows is None, rows)
 
@@ -229,9 +236,10 @@ class Assembly(eqx.Module):
         else:
             spin = 2 * turn(rates_matrix(q.orientation), v.orientation)
             turning = jnp.sum(spin * turn(bodies.inertia, spin))
+        of_rotors = sum((rotors.energy(frames) for rotors in self.rotors), jnp.zeros_like(moving))
         weight = -jnp.sum(bodies.mass * (frames.origin[:-1] @ self.gravity))
         stored = sum((loads.potential(frames) for loads in self.loads), weight)
-        return Energy((moving + turning) / 2, stored)
+        return Energy((moving + turning) / 2 + of_rotors, stored)
 
     def draw(
         self,

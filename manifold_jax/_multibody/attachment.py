@@ -74,6 +74,15 @@ class Attachment(eqx.Module):
         moving = frames.velocity[self.index] + jnp.cross(frames.spin[self.index], arms)
         return moving[1] - moving[0]
 
+    def rates(self, frames: Frames, sides: Sides, hinge: bool) -> Float[Array, " k"]:
+        """Return the time derivatives of the coordinates of hinges, or of sliders."""
+        axis = sides.frame_first[:, :, 2]
+        first, second = self.index
+        if hinge:
+            return dot(axis, frames.spin[second] - frames.spin[first])
+        turning = jnp.cross(frames.spin[first], axis)
+        return dot(axis, self.velocities(frames, sides)) + dot(turning, sides.gap)
+
 
 def attach(
     bodies: Bodies, things: Sequence[Any], names: Sequence[str], axes: Sequence[Any] | None = None

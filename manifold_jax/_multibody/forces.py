@@ -65,6 +65,24 @@ class Damper(AbstractLineForce):
     name: str | None = eqx.field(static=True, default=None)
 
 
+class RotationalDamper(AbstractForce):
+    """A damper between two bodies against their relative angular velocity: the torque on the second one is
+    `damping` times that of the first minus that of the second, and its opposite acts on the first.
+
+    For the friction of ball joints; that of a hinge is the `damping` of its [`JointSpring`][].
+
+    **Arguments:**
+
+    - `first`, `second`: names of bodies, one of them may be `mj.multibody.GROUND`.
+    - `damping` (N m s/rad).
+    """
+
+    first: str = eqx.field(static=True)
+    second: str = eqx.field(static=True)
+    damping: Any
+    name: str | None = eqx.field(static=True, default=None)
+
+
 class LinearActuator(AbstractLineForce):
     """A cylinder between two points that pushes them apart with the force `value` (N), a number or
     `f(t, args)`. Other arguments as for [`Spring`][]."""
@@ -101,6 +119,30 @@ class Motor(AbstractJointForce):
     """
 
     value: Any
+    name: str | None = eqx.field(static=True, default=None)
+
+
+class RotorInertia(AbstractForce):
+    """The inertia of a rotor that turns with a hinge or slider: `inertia x''` acts against its coordinate
+    `x`. MJCF calls it `armature`.
+
+    A motor with the moment of inertia `J` about its shaft, behind gears that make it turn `n` times as fast
+    as the joint, has `inertia = n^2 J`, for robots often more than that of the links. Its spin together with the
+    body that carries it is not part of it.
+
+    **Arguments:**
+
+    - `joint`: as for [`JointSpring`][].
+    - `inertia` (kg m^2, of a slider kg), not negative.
+
+    The assembly must be solved in the coordinates of its joints, see [`JointCoordinates`][]. Joints with
+    rotors must not form a closed loop by themselves.
+
+    Source: Featherstone, Rigid Body Dynamics Algorithms (2008), sec. 9.6.
+    """
+
+    joint: str = eqx.field(static=True)
+    inertia: Any
     name: str | None = eqx.field(static=True, default=None)
 
 

@@ -16,6 +16,7 @@ from .assembly import Assembly
 from .bodies import Pose
 from .checks import is_concrete
 from .frames import Frames
+from .rotors import names_of
 from .spanning_tree import find_spanning_tree, SpanningTree
 from .start import CLOSED
 from .system import ConstantAssembly
@@ -62,8 +63,10 @@ class JointCoordinates(eqx.Module):
         part of the tree, which is then solved by any solver alone.
     - `system`: both as a [`MechanicalSystem`][manifold_jax.MechanicalSystem].
 
-    The tree is the one with the fewest coordinates. To differentiate by numbers of the assembly, replace it inside
-    your function: `eqx.tree_at(lambda joints: joints.assembly, joints, changed)`.
+    The tree is the one with the fewest coordinates among those with all joints that have [`RotorInertia`][].
+
+    To differentiate by numbers of the assembly, replace it inside your function:
+    `eqx.tree_at(lambda joints: joints.assembly, joints, changed)`.
 
     Source: Featherstone, Rigid Body Dynamics Algorithms (2008), ch. 8.
     """
@@ -78,7 +81,14 @@ class JointCoordinates(eqx.Module):
                 f"`assembly` must be an `mj.multibody.Assembly`, got {type(assembly).__name__}. Of a robot take `robot.assembly`."
             )
         self.assembly = assembly
-        self.tree = find_spanning_tree(assembly.joints, len(assembly.names))
+        needed = names_of(assembly.rotors)
+        self.tree = find_spanning_tree(assembly.joints, len(assembly.names), needed)
+        if not set(needed) <= set(self.names):
+            left = [name for name in needed if name not in self.names]
+            raise ValueError(
+                f"`assembly`: joints with `RotorInertia` form a closed loop, with {left[:12]}. One joint of "
+                "every loop must have none: leave out a rotor, or add its inertia to that of a body."
+            )
         self.independent = None if assembly.independent is None else self._find_independent()
 
     @property

@@ -10,18 +10,13 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._base.types import Args, FloatScalar, RealScalarLike
-from .._base.user_functions import check_function
-from . import forces, joints
-from .attachment import attach, Attachment, grouped, name_all
-from .bodies import Bodies, Pose
-from .checks import check_shape, floating, is_concrete, stack, Values
-from .equations import DRIVEN
+from .attachment import Attachment
+from .bodies import Pose
+from .checks import floating, Values
 from .frames import Frames, in_space, Vectors
-from .joint_groups import attachment_of, find_joint, Found, JointGroup
 from .rotations import dot, length_of, turn
 
 
-_ADVICE = "Springs and motors belong to `Revolute` and `Prismatic` joints; between points use `Spring` and `LinearActuator`."
 Wrench = tuple[Float[Array, "n 3"], Float[Array, "n 3"]]  # forces, torques about the origins
 State = tuple[Pose, Pose]
 
@@ -105,11 +100,7 @@ class JointLoads(AbstractLoads):
         sides = self.attachment.sides(frames)
         axis = sides.frame_first[:, :, 2]
         first, second = self.attachment.index
-        if self.hinge:
-            rate = dot(axis, frames.spin[second] - frames.spin[first])
-        else:
-            turning = jnp.cross(frames.spin[first], axis)
-            rate = dot(axis, self.attachment.velocities(frames, sides)) + dot(turning, sides.gap)
+        rate = self.attachment.rates(frames, sides, self.hinge)
         push = -self.laws.force(sides.coordinate(self.hinge), rate, t, args)[:, None] * axis
         none = jnp.zeros_like(axis)
         force, torque = (none, push) if self.hinge else (push, none)
@@ -169,6 +160,23 @@ class ControlledLoads(AbstractLoads):
         return jnp.zeros((), frames.origin.dtype)
 
 
+class RotationalLoads(AbstractLoads):
+    """Loads of dampers against the angular velocities of second bodies relative to first ones."""
+
+    bodies: tuple[tuple[int, ...], tuple[int, ...]] = eqx.field(static=True)
+    damping: Float[Array, " k"]
+
+    def wrench(self, t: RealScalarLike, y: State, frames: Frames, args: Args) -> Wrench:
+        first, second = np.asarray(self.bodies)
+        torque = self.damping[:, None] * (frames.spin[first] - frames.spin[second])
+        none = jnp.zeros_like(torque)
+        on_second = apply(frames, second, frames.origin[second], none, torque)
+        return add(on_second, apply(frames, first, frames.origin[first], none, -torque))
+
+    def potential(self, frames: Frames) -> FloatScalar:
+        return jnp.zeros((), frames.origin.dtype)
+
+
 def apply(frames: Frames, index: np.ndarray, at: Vectors, force: Any, torque: Any) -> Wrench:
     """Sum forces at points in world coordinates, and torques, for every body about its origin."""
     torque = torque + jnp.cross(at - frames.origin[index], force)
@@ -178,78 +186,3 @@ def apply(frames: Frames, index: np.ndarray, at: Vectors, force: Any, torque: An
 
 def add(a: Wrench, b: Wrench) -> Wrench:
     return a[0] + b[0], a[1] + b[1]
-
-
-def group_forces(
-    bodies: Bodies, groups: tuple[JointGroup, ...], given: Any
-) -> tuple[AbstractLoads, ...]:
-    in_joint = lambda force: isinstance(force, forces.AbstractJointForce)
-    everything = name_all(given, forces.AbstractForce, "force")
-    named = [
-        (force, name, find_joint(groups, force.joint, name, _ADVICE) if in_joint(force) else None)
-        for force, name in everything
-        if not isinstance(force, forces.Controller)
-    ]
-    controlled = [
-        _controlled(groups, force, name)
-        for force, name in everything
-        if isinstance(force, forces.Controller)
-    ]
-    kinds = grouped(named, _kind).items()
-    return (*(_loads(kind, bodies, *own) for kind, own in kinds), *controlled)
-
-
-def _controlled(
-    groups: tuple[JointGroup, ...], controller: forces.Controller, name: str
-) -> ControlledLoads:
-    check_function(f"law` of `{name}", controller.law, "f(t, y, args)")
-    if not controller.joints:
-        raise ValueError(f"{name}: `joints` must name at least one hinge or slider.")
-    advice = "Controllers belong to `Revolute` and `Prismatic` joints."
-    found = tuple(find_joint(groups, joint, name, advice) for joint in controller.joints)
-    hinges = tuple(group.kind is joints.Revolute for group, _ in found)
-    return ControlledLoads(hinges, attachment_of(found, controller.joints), controller.law)
-
-
-def _kind(force: Any, name: str, found: Found | None) -> type:
-    """Return the kind of the joint that a force acts in, otherwise its own kind."""
-    if found is not None:
-        return found[0].kind
-    kinds = forces.AbstractLineForce, forces.Torque
-    return next((kind for kind in kinds if isinstance(force, kind)), forces.Force)
-
-
-def _loads(
-    kind: type, bodies: Bodies, things: tuple, names: tuple[str, ...], found: tuple
-) -> AbstractLoads:
-    if kind is forces.AbstractLineForce:
-        return LineLoads(attach(bodies, things, names), _laws(things, names, "length"))
-    if kind in DRIVEN:
-        laws = _laws(things, names, "rest")
-        return JointLoads(kind is joints.Revolute, attachment_of(found, names), laws)
-    return _on_bodies(kind is forces.Torque, bodies, things, names)
-
-
-def _laws(things: tuple, names: tuple[str, ...], rest: str) -> SpringLaws:
-    """Return the laws of forces; missing arguments are zero."""
-    named = list(zip(things, names, strict=True))
-    stiffness, rest_at, damping = (
-        stack([check_shape(f"{n}: `{word}`", getattr(thing, word, 0.0), ()) for thing, n in named])
-        for word in ("stiffness", rest, "damping")
-    )
-    values = Values("value", names, (), [getattr(thing, "value", 0.0) for thing in things])
-    driven = any(callable(v) or not is_concrete(v) or np.any(np.asarray(v)) for v in values.given)
-    return SpringLaws(stiffness, rest_at, damping, values if driven else None)
-
-
-def _on_bodies(torque: bool, bodies: Bodies, things: tuple, names: tuple[str, ...]) -> BodyLoads:
-    d = 2 if bodies.planar else 3
-    index, points = [], []
-    for thing, name in zip(things, names, strict=True):
-        index.append(bodies.moving_index(thing.body, name))
-        point = getattr(thing, "point", None)
-        point = np.zeros(d) if point is None else point
-        points.append(check_shape(f"{name}: `point`", point, (d,)))
-    shape = () if torque and bodies.planar else (d,)
-    values = Values("value", names, shape, [thing.value for thing in things])
-    return BodyLoads(torque, tuple(index), in_space(stack(points)), values)

@@ -14,7 +14,7 @@ from .._base.user_functions import check_function
 from .assembly import Assembly
 from .bodies import Pose
 from .checks import floating
-from .forces import AbstractForce, JointSpring, Motor
+from .forces import AbstractForce, JointSpring, Motor, RotationalDamper, RotorInertia
 from .mujoco_checks import actuator_fault, disabled, import_mujoco, refuse_unsupported
 from .mujoco_tree import quaternion_of, Tree
 from .rotations import quaternion_rate
@@ -43,12 +43,13 @@ def from_mujoco(
 
     Read are bodies with their inertias; hinge, slide, ball and free joints, two hinges with
     perpendicular axes through one point (a universal joint), hinge and slide on one axis (a
-    cylindrical one); stiffness and damping of hinges and slides; `equality` of the types connect and
+    cylindrical one); stiffness, damping and armature of hinges and slides (with armature solve
+    [`JointCoordinates`][] of the result, see [`RotorInertia`][]), damping of ball joints; `equality` of the types connect and
     weld; gravity; actuators of joints with constant gain and affine bias (motor, position, velocity,
     damper). The drawing is the pose `qpos0`. Stiffness of hinges counts angles from `-pi` to `pi`.
 
     **Raises** `ValueError` with the names of all elements that are not supported: tendons, contacts,
-    limits, friction, armature, and so on. Elements without effect on the motion (geometries that do not
+    limits, friction, and so on. Elements without effect on the motion (geometries that do not
     collide, sites, sensors, cameras) is left out.
     """
     mujoco = import_mujoco()
@@ -69,7 +70,7 @@ def from_mujoco(
     return Assembly(
         bodies,
         joints + tree.equalities(),
-        _springs(tree) + _actuators(tree, control),
+        _passive_forces(tree) + _actuators(tree, control),
         gravity=gravity,
         redundant=redundant,
     )
@@ -103,7 +104,8 @@ def load(mujoco: Any, model: Any) -> Any:
     return mujoco.MjModel.from_xml_string(model)
 
 
-def _springs(tree: Tree) -> list[AbstractForce]:
+def _passive_forces(tree: Tree) -> list[AbstractForce]:
+    """Return springs, dampers and rotors of joints."""
     model, found = tree.model, []
     for j, name in tree.joint_of.items():
         stiffness, damping = model.jnt_stiffness[j], model.dof_damping[model.jnt_dofadr[j]]
@@ -111,6 +113,12 @@ def _springs(tree: Tree) -> list[AbstractForce]:
         if stiffness != 0 or damping != 0:
             rest = model.qpos_spring[at] - model.qpos0[at]
             found.append(JointSpring(name, stiffness, rest, damping))  # pyright: ignore[reportArgumentType]
+        if (armature := model.dof_armature[model.jnt_dofadr[j]]) != 0:
+            found.append(RotorInertia(name, armature))  # pyright: ignore[reportArgumentType, reportCallIssue]
+    for j, (parent, body) in tree.balls.items():
+        if (damping := model.dof_damping[model.jnt_dofadr[j]]) != 0:
+            name = f"damping of {tree.name('joint', j)}"
+            found.append(RotationalDamper(parent, body, damping, name))  # pyright: ignore[reportCallIssue]
     return found
 
 

@@ -16,7 +16,6 @@ REFUSED = (
     ("jnt_stiffnesspoly", "joint", "nonlinear stiffness"),
     ("jnt_springyield", "joint", "plastic spring"),
     ("dof_frictionloss", "dof", "friction loss"),
-    ("dof_armature", "dof", "armature"),
     ("dof_dampingpoly", "dof", "nonlinear damping"),
     ("body_gravcomp", "body", "gravity compensation"),
     ("actuator_forcelimited", "actuator", "actuator force limit"),
@@ -36,6 +35,7 @@ OTHERS = (
     "disabled springs or dampers",
     "damping of several coordinates",
     "stiffness of several coordinates",
+    "armature of several coordinates",
     "moving body without mass",
     "actuator that is not of a joint",
     "actuator of several coordinates",
@@ -129,14 +129,20 @@ def _with_one_coordinate(mujoco: Any, model: Any, joint: Index) -> bool:
 
 
 def _forces_of_joints(mujoco: Any, model: Any) -> Iterator[tuple[str, str]]:
-    """Refuse springs and dampers of joints that have no single coordinate here."""
-    for d in range(model.nv):
-        joint = model.dof_jntid[d]
-        if not _with_one_coordinate(mujoco, model, joint) and model.dof_damping[d] != 0:
-            yield "damping of several coordinates", name_of(mujoco, model, "joint", joint)
+    """Refuse springs, dampers and rotors of joints that have no single coordinate here."""
+    ball = int(mujoco.mjtJoint.mjJNT_BALL)
     for joint in range(model.njnt):
-        if not _with_one_coordinate(mujoco, model, joint) and model.jnt_stiffness[joint] != 0:
-            yield "stiffness of several coordinates", name_of(mujoco, model, "joint", joint)
+        if _with_one_coordinate(mujoco, model, joint):
+            continue
+        name, own = name_of(mujoco, model, "joint", joint), model.dof_jntid == joint
+        damping, armature = model.dof_damping[own], model.dof_armature[own]
+        is_isotropic = int(model.jnt_type[joint]) == ball and np.ptp(damping) == 0
+        if np.any(damping != 0) and not is_isotropic:
+            yield "damping of several coordinates", name
+        if np.any(armature != 0):
+            yield "armature of several coordinates", name
+        if model.jnt_stiffness[joint] != 0:
+            yield "stiffness of several coordinates", name
     for i in range(1, model.nbody):
         if model.body_mass[i] == 0 and model.body_jntnum[i] > 0:
             yield "moving body without mass", name_of(mujoco, model, "body", i)

@@ -15,6 +15,7 @@ class Tree:
     def __init__(self, mujoco: Any, model: Any, drawing: Any):
         self.mujoco, self.model, self.drawing = mujoco, model, drawing
         self.joint_of: dict[int, str] = {}  # joints with a coordinate, by their index
+        self.balls: dict[int, tuple[str, str]] = {}  # the bodies of ball joints, by their index
 
     def name(self, kind: str, i: Index) -> str:
         return name_of(self.mujoco, self.model, kind, i)
@@ -63,6 +64,7 @@ class Tree:
         if types == ("FREE",):
             return []
         if types == ("BALL",):
+            self.balls[own[0]] = parent, body
             return [Spherical(parent, body, at=at, name=name)]
         if len(own) == 1:
             self.joint_of[own[0]] = name

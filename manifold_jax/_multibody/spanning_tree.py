@@ -58,28 +58,29 @@ class SpanningTree(NamedTuple):
         return found[:number, :number]
 
 
-def find_spanning_tree(groups: tuple[JointGroup, ...], number: int) -> SpanningTree:
+def find_spanning_tree(
+    groups: tuple[JointGroup, ...], number: int, needed: tuple[str, ...] = ()
+) -> SpanningTree:
     """Return a tree with the fewest coordinates: a minimum spanning tree by Prim's algorithm, from the
     ground, or for bodies that are not tied to it from the first of them, which moves freely.
 
-    Of joints with as many freedoms those nearest to the ground come first.
+    Joints with the names `needed` come first, whatever their freedoms; of joints with as many freedoms
+    those nearest to the ground.
     """
     candidates = [
-        (FREEDOMS[group.kind], place, first, second)
+        ((name not in needed, FREEDOMS[group.kind]), (g, i), first, second)
         for g, group in enumerate(groups)
         if group.motions is None and group.kind in FREEDOMS
-        for place, first, second in zip(
-            [(g, i) for i in range(len(group.attachment.names))],
-            *group.attachment.bodies,
-            strict=True,
+        for i, (name, first, second) in enumerate(
+            zip(group.attachment.names, *group.attachment.bodies, strict=True)
         )
     ]
     edges: dict[int, Edge] = {}
     depth = {number: 0}
     while len(depth) <= number:
         across = [
-            (freedoms, depth[parent], place, parent, body, turned)
-            for freedoms, place, first, second in candidates
+            (weight, depth[parent], place, parent, body, turned)
+            for weight, place, first, second in candidates
             for parent, body, turned in ((first, second, False), (second, first, True))
             if parent in depth and body not in depth
         ]

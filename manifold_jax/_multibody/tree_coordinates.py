@@ -58,6 +58,11 @@ class TreeCoordinates(NamedTuple):
             of_point.append(ends[1])
         return np.array(of_axis, int), np.array(of_point, int)
 
+    def numbers_of(self, names: tuple[str, ...]) -> np.ndarray:
+        """Return the numbers of joints with one coordinate, by name."""
+        known = {column.name: c for c, column in enumerate(self.columns)}
+        return np.array([known[name] for name in names], int)
+
     def has(self, kind: str) -> bool:
         """Return whether any joint has coordinates of a kind."""
         return any(column.kind == kind for column in self.columns)

@@ -25,13 +25,15 @@ from .tree_readings import poses_of
 
 class TreeMass(eqx.Module):
     """`M = sum_i m_i V_i^T V_i + W_i^T I_i W_i` with the derivatives `V_i` of the velocities of the bodies by
-    those of `q`, and `W_i` of the angular velocities. Singular along quaternions, whose norms are constraints."""
+    those of `q`, and `W_i` of the angular velocities; on the diagonal also the inertias of rotors. Singular along
+    quaternions, whose norms are constraints."""
 
     source: Callable
     tree: SpanningTree = eqx.field(static=True)
 
     def __call__(self, q: Float[Array, " n"], args: Args) -> Float[Array, "n n"]:
-        motion = motion_of(self.source(args), self.tree)
+        assembly = self.source(args)
+        motion = motion_of(assembly, self.tree)
         at = motion.place(q)
         along, about = motion.jacobians(at)
         rows = lambda J: jnp.moveaxis(J, 1, 0).reshape(J.shape[1], -1)
@@ -40,7 +42,11 @@ class TreeMass(eqx.Module):
         half = gram(
             rows(jnp.concatenate([along, about])), rows(jnp.concatenate([momentum, turning]))
         )
-        return (half + half.T) / 2
+        mass = (half + half.T) / 2
+        for rotors in assembly.rotors:
+            own = motion.coordinates.numbers_of(rotors.joints)
+            mass = mass.at[own, own].add(rotors.inertia.astype(mass.dtype))
+        return mass
 
 
 class TreeForces(eqx.Module):
