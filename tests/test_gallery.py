@@ -15,6 +15,7 @@ import numpy_residuals
 import optimistix as optx
 import outside
 import pytest
+from variants import variants
 
 import manifold_jax as mj
 
@@ -56,7 +57,8 @@ KINDS = {"pendulum", "rigid-body", "kepler", "sphere-flow", "skate", "four-bar",
 
 def cases(kind):
     """Pairs of problem and solver, most of them in the slow part. Solutions with every solver; steps and
-    events, which do not depend on it, with one, but for the problem from outside."""
+    events, which do not depend on it, with one, but for the problem from outside; events of one problem of
+    each kind."""
     return [
         pytest.param(
             name,
@@ -65,6 +67,7 @@ def cases(kind):
         )
         for name, solver in EVERY
         if kind == "accurate" or solver == "tsit5" or (name, solver) in ALSO
+        if kind != "events" or name in KINDS_OF_EVENTS
     ]
 
 
@@ -75,6 +78,7 @@ def _is_default(kind, name, solver):
 
 
 ALSO = {("outside", "kvaerno5"), ("pendulum", "tsit5")}
+KINDS_OF_EVENTS = KINDS | {"outside", "car-axis", "jay2", "rolling-disc"}
 
 
 class Case:
@@ -192,7 +196,7 @@ def test_steps_with_plain_diffrax(case, solver):
     assert case.violation(sol.ts, sol.ys) <= 1e-12
 
 
-@pytest.mark.parametrize(("case", "solver"), cases("other"), indirect=["case"])
+@pytest.mark.parametrize(("case", "solver"), cases("events"), indirect=["case"])
 def test_event_is_on_the_manifold(case, solver):
     cond_fn = case.event_function
     sol = mj.diffeqsolve(
@@ -211,29 +215,34 @@ def test_event_is_on_the_manifold(case, solver):
     assert abs(cond_fn(sol.ts[0], jax.tree.map(lambda leaf: leaf[0], sol.ys), case.args)) <= 1e-8
 
 
-@pytest.mark.parametrize("case", ["car-axis", "skate", "outside"], indirect=True)
+DIRECTIONS = [(name, "tsit5") for name in ("car-axis", "skate", "outside")]
+MORE_DIRECTIONS = [("car-axis", "kvaerno5"), ("skate", "dopri8"), *EVERY[: len(SOLVERS)]]
+
+
 @pytest.mark.parametrize(
-    "solver",
-    ["tsit5", *(pytest.param(name, marks=pytest.mark.slow) for name in SOLVERS if name != "tsit5")],
+    ("case", "solver"),
+    variants(dict.fromkeys(DIRECTIONS + MORE_DIRECTIONS), DIRECTIONS),
+    indirect=["case"],
 )
 def test_backward_in_time(case, solver):
     """Time-dependent constraints, from t1 back to t0; the start is the end of a forward run."""
-    projected = mj.Projected(SOLVERS[solver][0], case.constraint)
-    forward = mj.diffeqsolve(
-        case.terms, projected, case.t0, case.t1, None, case.y0, **case.options(solver)
-    )
-    end = jax.tree.map(lambda leaf: leaf[0], forward.ys)
-    ts = jnp.linspace(case.t1, case.t0, 200)
-    sol = mj.diffeqsolve(
-        case.terms,
-        projected,
-        case.t1,
-        case.t0,
-        None,
-        end,
-        saveat=dfx.SaveAt(subs=[dfx.SubSaveAt(ts=ts), dfx.SubSaveAt(steps=True)], dense=True),
-        **case.options(solver),
-    )
+
+    @jax.jit
+    def solve(t0, t1, y0):
+        steps, times = dfx.SubSaveAt(steps=True), dfx.SubSaveAt(ts=jnp.linspace(t0, t1, 200))
+        return mj.diffeqsolve(
+            case.terms,
+            mj.Projected(SOLVERS[solver][0], case.constraint),
+            t0,
+            t1,
+            None,
+            y0,
+            saveat=dfx.SaveAt(subs=[times, steps], dense=True),
+            **case.options(solver),
+        )
+
+    forward = solve(case.t0, case.t1, case.y0)
+    sol = solve(case.t1, case.t0, jax.tree.map(lambda leaf: leaf[-1], forward.ys[0]))
     assert case.violation(sol.ts[0], sol.ys[0]) <= 1e-12
     assert case.violation(sol.ts[1], sol.ys[1]) <= 1e-12
     times = np.random.default_rng(1).uniform(case.t0, case.t1, size=1000)
