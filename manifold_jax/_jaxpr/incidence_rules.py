@@ -10,7 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from .primitives import arranged_factors, ELEMENTWISE, evaluated, MOVES, sources, VANISHING
+from .known_values import evaluated
+from .primitives import arranged_factors, ELEMENTWISE, MOVES, sources, VANISHING
 
 
 class Dependence(NamedTuple):

@@ -11,9 +11,9 @@ import numpy as np
 from jax import lax
 
 from . import primitives
+from .known_values import evaluated, unsharded
 from .lane_arrays import Lanes
 from .lane_value import LaneValue, Number, object_array
-from .primitives import evaluated, unsharded
 
 
 ELEMENTWISE = frozenset({*primitives.VANISHING, *primitives.ELEMENTWISE}).union(

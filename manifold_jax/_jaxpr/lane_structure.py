@@ -8,10 +8,11 @@ import numpy as np
 from jax import lax
 
 from .._base import device
+from .known_values import evaluated
 from .lane_arithmetic import apply
 from .lane_arrays import Lanes, NotScalarError
 from .lane_value import LaneValue, object_array
-from .primitives import arranged_factors, evaluated, sources
+from .primitives import arranged_factors, sources
 
 
 def move(lanes: Lanes, equation: Any, values: list[LaneValue]) -> list[LaneValue] | None:

@@ -1,12 +1,12 @@
-"""Primitives of JAX: their values for known operands, and those that only move numbers."""
+"""Primitives of JAX: those that vanish at zero, those that only move numbers."""
 
 import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
+
+from .known_values import evaluated
 
 
 # Elementwise primitives: those whose value at zeros is zero, and others.
@@ -21,71 +21,9 @@ ELEMENTWISE = """
 """.split()
 
 
-def _slice(parameters: dict, x: np.ndarray) -> np.ndarray:
-    strides = parameters["strides"] or (1,) * x.ndim
-    return x[tuple(map(slice, parameters["start_indices"], parameters["limit_indices"], strides))]
-
-
-def _reshape(parameters: dict, x: np.ndarray) -> np.ndarray:
-    order = parameters["dimensions"]  # in which the axes are read
-    return (x if order is None else x.transpose(order)).reshape(parameters["new_sizes"])
-
-
-def _broadcast(parameters: dict, x: np.ndarray) -> np.ndarray:
-    shape, own = parameters["shape"], parameters["broadcast_dimensions"]
-    new = tuple(axis for axis in range(len(shape)) if axis not in own)
-    return np.broadcast_to(np.expand_dims(x, new), shape)
-
-
-_MOVED_BY_NUMPY: dict[str, Callable[..., np.ndarray]] = {
-    "broadcast_in_dim": _broadcast,
-    "concatenate": lambda parameters, *xs: np.concatenate(xs, parameters["dimension"]),
-    "copy": lambda parameters, x: x,
-    "copy_p": lambda parameters, x: x,
-    "reshape": _reshape,
-    "rev": lambda parameters, x: np.flip(x, parameters["dimensions"]),
-    "slice": _slice,
-    "squeeze": lambda parameters, x: np.squeeze(x, tuple(parameters["dimensions"])),
-    "transpose": lambda parameters, x: x.transpose(parameters["permutation"]),
-}
-_COMPUTED_BY_NUMPY: dict[str, Callable[..., np.ndarray]] = {
-    "add": np.add,
-    "add_any": np.add,
-    "and": np.bitwise_and,
-    "div": np.divide,
-    "eq": np.equal,
-    "ge": np.greater_equal,
-    "gt": np.greater,
-    "le": np.less_equal,
-    "lt": np.less,
-    "mul": np.multiply,
-    "ne": np.not_equal,
-    "neg": np.negative,
-    "sub": np.subtract,
-}
-
-
-def evaluated(primitive: Any, params: dict, operands: Sequence[Any]) -> list[np.ndarray]:
-    """Return the results for known operands, by NumPy where that is quicker."""
-    name = primitive.name
-    if name in _MOVED_BY_NUMPY:
-        return [_MOVED_BY_NUMPY[name](params, *operands)]
-    rounds = name == "div" and not np.issubdtype(operands[0].dtype, np.inexact)  # towards zero
-    if name in _COMPUTED_BY_NUMPY and not rounds:
-        with np.errstate(all="ignore"):
-            return [np.asarray(_COMPUTED_BY_NUMPY[name](*operands))]
-    with jax.ensure_compile_time_eval():
-        out = primitive.bind(*map(jnp.asarray, operands), **unsharded(params))
-    return [np.asarray(x) for x in (out if primitive.multiple_results else [out])]
-
-
-def unsharded(params: dict) -> dict:
-    """Return the parameters of the primitive for arrays of a single device."""
-    return {**params, "sharding": None} if "sharding" in params else params
-
-
 # The operands that are moved; those after them say where to.
-_MOVED = dict.fromkeys(_MOVED_BY_NUMPY, slice(1)) | {
+_OF_FIRST = "broadcast_in_dim copy copy_p reshape rev slice squeeze transpose"
+_MOVED = dict.fromkeys(_OF_FIRST.split(), slice(1)) | {
     "concatenate": slice(None),
     "dynamic_slice": slice(1),
     "dynamic_update_slice": slice(2),

@@ -9,7 +9,8 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 
-from .primitives import arranged_factors, evaluated
+from .known_values import evaluated
+from .primitives import arranged_factors
 from .trace import called, walk
 
 

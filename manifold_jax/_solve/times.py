@@ -11,6 +11,7 @@ import jax
 import jax.core
 import jax.numpy as jnp
 import jax.tree_util as jtu
+import numpy as np
 from diffrax import RESULTS
 
 from .._base.types import BoolScalar, IntScalar, RealScalarLike
@@ -54,6 +55,11 @@ def is_no_step(dt0: RealScalarLike) -> BoolScalar:
     return ~jnp.isfinite(dt0) | (jnp.asarray(dt0) == 0)
 
 
+def _arrays_for(*values: Any) -> Any:
+    """Return NumPy for values that are known, for which JAX would compile a program for each operation."""
+    return jnp if any(isinstance(value, jax.core.Tracer) for value in values) else np
+
+
 class _Faults(NamedTuple):
     """The faults of the times of a solve: whether there are any, which one to report, and the messages."""
 
@@ -64,15 +70,20 @@ class _Faults(NamedTuple):
     @staticmethod
     def of(t0: Any, t1: Any, dt0: Any, saveat: dfx.SaveAt) -> "_Faults":
         subs = jtu.tree_leaves(saveat.subs, is_leaf=lambda x: isinstance(x, dfx.SubSaveAt))
-        found = [(jnp.any(jnp.isnan(s.ts)), NO_OUTPUT_TIME) for s in subs if s.ts is not None]
+        given = [sub.ts for sub in subs if sub.ts is not None]
+        known = not any(isinstance(x, jax.core.Tracer) for x in (t0, t1, dt0, *given))
+        xp = (
+            np if known else jnp
+        )  # a program for each of these operations takes longer than they do
+        found = [(xp.any(xp.isnan(ts)), NO_OUTPUT_TIME) for ts in given]
         if dt0 is not None:
-            found.append((is_no_step(dt0), NO_FIRST_STEP))
-        found += [(jnp.isnan(t1), _NO_END), (~jnp.isfinite(t0), _NO_START)]
-        number, applies = jnp.zeros((), jnp.int32), [fault for fault, _ in found]
+            found.append((~xp.isfinite(dt0) | (xp.asarray(dt0) == 0), NO_FIRST_STEP))
+        found += [(xp.isnan(t1), _NO_END), (~xp.isfinite(t0), _NO_START)]
+        number, applies = xp.zeros((), np.int32), [fault for fault, _ in found]
         for i, fault in enumerate(applies):
-            number = jnp.where(fault, i, number)
+            number = xp.where(fault, np.int32(i), number)
         return _Faults(
-            functools.reduce(jnp.logical_or, applies), number, [text for _, text in found]
+            functools.reduce(xp.logical_or, applies), number, [text for _, text in found]
         )
 
 
@@ -80,7 +91,7 @@ def _attach(t0: Any, fault: BoolScalar, number: Any, messages: list[str]) -> Any
     """Attach an error to a time; a time that is known to have none stays a number."""
     if not isinstance(fault, jax.core.Tracer) and not bool(fault):
         return t0
-    return eqx.branched_error_if(jnp.asarray(t0), fault, number, messages)
+    return eqx.branched_error_if(jnp.asarray(t0), jnp.asarray(fault), number, messages)
 
 
 def refusing_missing_times(function: Function) -> Function:
@@ -100,7 +111,8 @@ def refusing_missing_times(function: Function) -> Function:
             return function(*args, **kwargs)
         with jax.ensure_compile_time_eval(), jax.numpy_dtype_promotion("standard"):
             faults = _Faults.of(t0, t1, dt0, saveat)
-            astray = jnp.asarray(False if dt0 is None else (jnp.asarray(t1) - t0) * dt0 < 0)
+            xp = _arrays_for(t0, t1, dt0)
+            astray = np.False_ if dt0 is None else (xp.asarray(t1) - t0) * dt0 < 0
         given["t0"] = _attach(t0, astray, 0, [WRONG_SIGN])
         if throw:
             given["t0"] = _attach(given["t0"], *faults)
