@@ -24,6 +24,7 @@ CASES = {
     "split": (lambda x: lax.split(x, (1, 2), 1), X),
     "stack": (lambda x: jnp.stack([x, x + 1], 1), X),
     "unstack": (lambda x: jnp.unstack(x, axis=1), X),
+    "unstack a vector": (jnp.unstack, X[0]),
     "concatenate": (lambda x: lax.concatenate([x, x], 1), X),
     "reverse": (lambda x: lax.rev(x, (0,)), X),
     "transpose": (lambda x: lax.transpose(x, (1, 0)), X),

@@ -97,7 +97,7 @@ def _split(parameters: dict, x: np.ndarray) -> list[np.ndarray]:
 
 
 def _unstack(parameters: dict, x: np.ndarray) -> list[np.ndarray]:
-    return list(np.moveaxis(x, parameters["axis"], 0))
+    return list(map(np.asarray, np.moveaxis(x, parameters["axis"], 0)))
 
 
 def _alone(function: Callable) -> Callable:

@@ -14,7 +14,7 @@ import jax.tree_util as jtu
 import numpy as np
 from diffrax import RESULTS
 
-from .._base.types import BoolScalar, IntScalar, RealScalarLike
+from .._base.types import BoolScalar, RealScalarLike
 
 
 Function = TypeVar("Function", bound=Callable)
@@ -61,20 +61,18 @@ def _arrays_for(*values: Any) -> Any:
 
 
 class _Faults(NamedTuple):
-    """The faults of the times of a solve: whether there are any, which one to report, and the messages."""
+    """The faults of the times of a solve: whether there are any, which one to report, and the messages. The
+    first two are numbers of NumPy where all times are known."""
 
-    any: BoolScalar
-    number: IntScalar
+    any: Any
+    number: Any
     messages: list[str]
 
     @staticmethod
     def of(t0: Any, t1: Any, dt0: Any, saveat: dfx.SaveAt) -> "_Faults":
         subs = jtu.tree_leaves(saveat.subs, is_leaf=lambda x: isinstance(x, dfx.SubSaveAt))
         given = [sub.ts for sub in subs if sub.ts is not None]
-        known = not any(isinstance(x, jax.core.Tracer) for x in (t0, t1, dt0, *given))
-        xp = (
-            np if known else jnp
-        )  # a program for each of these operations takes longer than they do
+        xp = _arrays_for(t0, t1, dt0, *given)
         found = [(xp.any(xp.isnan(ts)), NO_OUTPUT_TIME) for ts in given]
         if dt0 is not None:
             found.append((~xp.isfinite(dt0) | (xp.asarray(dt0) == 0), NO_FIRST_STEP))
@@ -87,7 +85,7 @@ class _Faults(NamedTuple):
         )
 
 
-def _attach(t0: Any, fault: BoolScalar, number: Any, messages: list[str]) -> Any:
+def _attach(t0: Any, fault: Any, number: Any, messages: list[str]) -> Any:
     """Attach an error to a time; a time that is known to have none stays a number."""
     if not isinstance(fault, jax.core.Tracer) and not bool(fault):
         return t0
