@@ -22,27 +22,23 @@ jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
 
-PROCESS = Path("/proc/self")
+MAPPINGS = Path("/proc/self/maps")
 MOST_MAPPINGS = 30_000
-MOST_MEMORY = 3e9  # bytes
 
 
-def _is_full():
-    """Every compiled program takes memory, and mappings of it; Linux allows a process 65530 of these, and
-    beyond that the compiler crashes."""
-    if not PROCESS.exists():
-        return True
-    pages = int((PROCESS / "statm").read_text().split()[1])
-    mappings = (PROCESS / "maps").read_text().count("\n")
-    return mappings > MOST_MAPPINGS or pages * os.sysconf("SC_PAGE_SIZE") > MOST_MEMORY
+@pytest.fixture(autouse=True, scope="module")
+def _bounded_memory():
+    """Compiled programs of one file are of no use to the next, and there are many."""
+    yield
+    jax.clear_caches()
 
 
 @pytest.fixture(autouse=True)
-def _bounded_memory():
-    """Forget compiled programs before they are too many. Small ones, of single operations, are used by many
-    tests: half of them need not be compiled again."""
+def _bounded_mappings():
+    """Every compiled program takes memory mappings; Linux allows a process 65530 of them, and
+    beyond that the compiler crashes."""
     yield
-    if _is_full():
+    if MAPPINGS.exists() and MAPPINGS.read_text().count("\n") > MOST_MAPPINGS:
         jax.clear_caches()
         gc.collect()
 
