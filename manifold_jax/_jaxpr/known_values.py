@@ -16,11 +16,12 @@ def evaluated(primitive: Any, params: dict, operands: Sequence[Any]) -> list[np.
     name = primitive.name
     if name in _MOVED:
         return [np.asarray(x) for x in _MOVED[name](params, *operands)]
-    if name in _COMPUTED and _is_exact(name, params, operands):
+    if _is_exact(name, params, operands):
         with np.errstate(all="ignore"):
-            return [np.asarray(_COMPUTED[name](*operands))]
-    if name == "convert_element_type" and _is_exact(name, params, operands):
-        return [np.asarray(operands[0]).astype(params["new_dtype"])]
+            if name == "convert_element_type":
+                return [np.asarray(operands[0]).astype(params["new_dtype"])]
+            if name in _COMPUTED:
+                return [np.asarray(_COMPUTED[name](*operands))]
     with jax.ensure_compile_time_eval():
         out = primitive.bind(*operands, **unsharded(params))
     return [np.asarray(x) for x in (out if primitive.multiple_results else [out])]
@@ -33,15 +34,15 @@ def unsharded(params: dict) -> dict:
 
 def _is_exact(name: str, params: dict, operands: Sequence[Any]) -> bool:
     """Return whether NumPy does the same: not where integers are divided, or made of other numbers, and not
-    with types that it does not know itself, such as `bfloat16`."""
+    with complex numbers (other roundings) or types that it does not know itself, such as `bfloat16`."""
     kinds = [np.asarray(x).dtype.kind for x in operands]
-    if "V" in kinds:
+    if not set(kinds) <= set("biuf"):
         return False
     if name == "div":
-        return kinds[0] in "fc"
+        return kinds[0] == "f"
     if name == "convert_element_type":
         new = np.dtype(params["new_dtype"]).kind
-        return kinds[0] in "bui" or kinds[0] == new == "f"
+        return new == "f" or (kinds[0] in "biu" and new in "biu")
     if name == "select_n":
         return len(operands) == 3
     return True

@@ -138,7 +138,7 @@ class RotorInertia(AbstractForce):
     The assembly must be solved in the coordinates of its joints, see [`JointCoordinates`][]. Joints with
     rotors must not form a closed loop by themselves.
 
-    Source: Featherstone, Rigid Body Dynamics Algorithms (2008), sec. 9.6.
+    Source: MuJoCo's XML reference, `armature` of joints.
     """
 
     joint: str = eqx.field(static=True)

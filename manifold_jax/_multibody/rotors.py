@@ -60,7 +60,7 @@ def names_of(rotors: tuple[Rotors, ...]) -> tuple[str, ...]:
 
 
 def refuse_rotors(rotors: tuple[Rotors, ...]) -> None:
-    """Rotors between bodies are no part of the mass matrix of these, which has a block for each."""
+    """Raise where there are rotors: they are no part of the mass matrix of bodies, which has a block for each."""
     if rotors:
         raise ValueError(
             f"`RotorInertia` of the joints {list(names_of(rotors))[:12]} couples bodies, which is supported in the coordinates "
