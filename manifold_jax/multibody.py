@@ -6,6 +6,7 @@ from ._multibody import (
     Assembly as Assembly,
     Body as Body,
     Controller as Controller,
+    Coupling as Coupling,
     Cylindrical as Cylindrical,
     Damper as Damper,
     Distance as Distance,

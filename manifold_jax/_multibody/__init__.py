@@ -18,6 +18,7 @@ from .forces import (
 from .joint_coordinates import JointCoordinates as JointCoordinates
 from .joints import (
     AbstractJoint as AbstractJoint,
+    Coupling as Coupling,
     Cylindrical as Cylindrical,
     Distance as Distance,
     Drive as Drive,

@@ -14,6 +14,7 @@ from .._base.types import Args, RealScalarLike
 from .._mechanics import MechanicalSystem
 from .bodies import Bodies, Body, Pose
 from .checks import check_shape, floating, is_concrete
+from .couplings import Couplings, group_couplings
 from .equations import DRIVEN
 from .force_groups import group_forces
 from .forces import AbstractForce
@@ -26,9 +27,9 @@ from .loads import AbstractLoads
 from .picture import draw_outline, new_axes, outline_of, write_film
 from .reading import Energy, JointForce, Motion, over_times, Times
 from .rotations import rates_matrix, turn
-from .rotors import group_rotors, refuse_rotors, Rotors
+from .rotors import group_rotors, Rotors
 from .start import make_state
-from .system import ConstantAssembly, system_of
+from .system import check_for_poses, ConstantAssembly, system_of
 
 
 class Assembly(eqx.Module):
@@ -46,8 +47,8 @@ class Assembly(eqx.Module):
     **Arguments:**
 
     - `bodies`: [`Body`][], in any order. `joints`: [`Revolute`][], [`Spherical`][],
-        [`Prismatic`][], [`Cylindrical`][], [`Universal`][], [`Fixed`][], [`Distance`][], and [`Drive`][]
-        where their motion is prescribed.
+        [`Prismatic`][], [`Cylindrical`][], [`Universal`][], [`Fixed`][], [`Distance`][]; [`Drive`][]
+        where their motion is prescribed, and [`Coupling`][] of two of them.
     - `forces`: [`Spring`][], [`Damper`][], [`RotationalDamper`][], [`JointSpring`][], [`Motor`][],
         [`LinearActuator`][], [`Controller`][], [`Force`][], [`Torque`][], and [`RotorInertia`][].
     - `gravity` (m/s^2): shape `(2,)` or `(3,)`; `None` for none.
@@ -67,6 +68,7 @@ class Assembly(eqx.Module):
 
     bodies: Bodies
     joints: tuple[JointGroup, ...]
+    couplings: Couplings
     loads: tuple[AbstractLoads, ...]
     rotors: tuple[Rotors, ...]
     gravity: Float[Array, "3"]
@@ -85,6 +87,7 @@ class Assembly(eqx.Module):
         self.bodies = Bodies.of(bodies)
         d = 2 if self.bodies.planar else 3
         self.joints = group_restraints(self.bodies, joints)
+        self.couplings = group_couplings(self.joints, joints)
         self.loads = group_forces(self.bodies, self.joints, forces)
         self.rotors = group_rotors(self.joints, forces)
         gravity = np.zeros(d) if gravity is None else gravity
@@ -102,8 +105,9 @@ class Assembly(eqx.Module):
         """Masses, constraints and forces as a [`MechanicalSystem`][], which has the `terms`, the
         manifold `constraint` and the `multipliers`.
 
-        **Raises** `ValueError` for [`RotorInertia`][]: use [`JointCoordinates`][]."""
-        refuse_rotors(self.rotors)
+        **Raises** `ValueError` for [`RotorInertia`][], [`Coupling`][] and bodies without mass: use
+        [`JointCoordinates`][]."""
+        check_for_poses(self)
         rows = None if self.independent is None else self.independent.rows
         return system_of(ConstantAssembly(self), self.redundant and rows is None, rows)
 

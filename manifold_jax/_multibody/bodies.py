@@ -54,7 +54,8 @@ class Body(eqx.Module):
     **Arguments:**
 
     - `name`: what joints and forces call it.
-    - `mass` (kg), positive.
+    - `mass` (kg), positive, or zero with zero `inertia`, for a link between joints: the assembly is then
+        solved in the coordinates of its joints, see [`JointCoordinates`][].
     - `inertia` (kg m^2) about the centre of mass: a number for a body in the plane; for one in
         space the moments about the axes of its frame, shape `(3,)`, or the matrix `(3, 3)`.
     - `position` of the centre of mass (m), shape `(2,)` or `(3,)`, and `orientation` (an angle,
@@ -110,11 +111,15 @@ def check_orientation(what: str, value: Any, planar: bool) -> Float[Array, "..."
 
 
 def _check_mass(body: Body) -> None:
-    if is_concrete(body.mass) and not float(body.mass) > 0:
-        raise ValueError(f"Body {body.name!r}: `mass` must be positive, got {float(body.mass)}.")
     if not is_concrete(body.inertia):
         return
     inertia = np.asarray(body.inertia, float)
+    if is_concrete(body.mass) and float(body.mass) == 0 and not inertia.any():
+        return
+    if is_concrete(body.mass) and not float(body.mass) > 0:
+        raise ValueError(
+            f"Body {body.name!r}: `mass` must be positive, or zero with zero `inertia`, got {float(body.mass)}."
+        )
     matrix = inertia if inertia.ndim == 2 else np.diag(np.atleast_1d(inertia))
     size = 1e-6 * np.abs(matrix).max()
     if not np.all(np.abs(matrix - matrix.T) <= size):

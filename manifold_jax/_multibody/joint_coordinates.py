@@ -15,7 +15,9 @@ from .._mechanics import MechanicalConstraint, MechanicalSystem
 from .assembly import Assembly
 from .bodies import Pose
 from .checks import is_concrete
+from .couplings import Couplings
 from .frames import Frames
+from .joint_groups import bodies_of
 from .rotors import names_of
 from .spanning_tree import find_spanning_tree, SpanningTree
 from .start import CLOSED
@@ -63,7 +65,10 @@ class JointCoordinates(eqx.Module):
         part of the tree, which is then solved by any solver alone.
     - `system`: both as a [`MechanicalSystem`][manifold_jax.MechanicalSystem].
 
-    The tree is the one with the fewest coordinates among those with all joints that have [`RotorInertia`][].
+    The tree is the one with the fewest coordinates among those with all joints that have [`RotorInertia`][] or
+    [`Coupling`][].
+
+    **Raises** `ValueError` where such joints form a closed loop, and for bodies without mass that move no others.
 
     To differentiate by numbers of the assembly, replace it inside your function:
     `eqx.tree_at(lambda joints: joints.assembly, joints, changed)`.
@@ -81,14 +86,16 @@ class JointCoordinates(eqx.Module):
                 f"`assembly` must be an `mj.multibody.Assembly`, got {type(assembly).__name__}. Of a robot take `robot.assembly`."
             )
         self.assembly = assembly
-        needed = names_of(assembly.rotors)
+        coupled = assembly.couplings.joints + assembly.couplings.others
+        needed = tuple(dict.fromkeys(names_of(assembly.rotors) + coupled))
         self.tree = find_spanning_tree(assembly.joints, len(assembly.names), needed)
         if not set(needed) <= set(self.names):
             left = [name for name in needed if name not in self.names]
             raise ValueError(
-                f"`assembly`: joints with `RotorInertia` form a closed loop, with {left[:12]}. One joint of "
-                "every loop must have none: leave out a rotor, or add its inertia to that of a body."
+                f"`assembly`: joints with `RotorInertia` or `Coupling` form a closed loop, with {left[:12]}. One joint of "
+                "every loop must have neither: leave one out, or add the inertia of a rotor to that of a body."
             )
+        self._check_masses()
         self.independent = None if assembly.independent is None else self._find_independent()
 
     @property
@@ -139,13 +146,35 @@ class JointCoordinates(eqx.Module):
 
     @property
     def _has_constraints(self) -> bool:
-        return any(self.tree.loops) or self._motion.coordinates.has("quaternion")
+        has_loops = any(self.tree.loops) or bool(self.assembly.couplings.names)
+        return has_loops or self._motion.coordinates.has("quaternion")
 
     def _field(self, t: RealScalarLike, y: State, args: Args) -> State:
         source = ConstantAssembly(self.assembly)
         mass = factorize_positive(TreeMass(source, self.tree)(y[0], args))
         a = mass.solve(TreeForces(source, self.tree)(t, *y, args))
         return y[1], a + jnp.where(mass.usable, 0, jnp.nan).astype(a.dtype)
+
+    def _check_masses(self) -> None:
+        """Refuse bodies without mass at ends of the tree, which any force would accelerate without bound: those that
+        move nothing with mass, and that no loop, drive, coupling or rotor holds."""
+        assembly, tree = self.assembly, self.tree
+        if not is_concrete(assembly.bodies.mass):
+            return
+        pairs = zip(assembly.joints, tree.loops, strict=True)
+        loops = [bodies_of((group,))[:, list(own)].reshape(-1) for group, own in pairs]
+        fixed = np.append(np.asarray(assembly.bodies.mass) > 0, True)
+        fixed[np.concatenate([np.zeros(0, int), *loops])] = True
+        is_fixed = (tree.is_moved() & fixed[:-1, None]).any(axis=0)
+        held = names_of(assembly.rotors) + assembly.couplings.joints + assembly.couplings.others
+        columns = self._motion.coordinates.columns
+        free = [c.body for c in columns if not is_fixed[c.body] and c.name not in held]
+        if free:
+            names = [assembly.names[i] for i in dict.fromkeys(free)]
+            raise ValueError(
+                f"`assembly`: the bodies {names[:12]} have no mass and move none that has. Give them mass and inertia, or "
+                "weld them by `Fixed` joints."
+            )
 
     def _check(self, found: State, y: tuple[Pose, Pose]) -> None:
         ours, given = _frames(*_poses(self._motion, *found)), _frames(*y)
@@ -174,7 +203,7 @@ class JointCoordinates(eqx.Module):
             for group, own in zip(groups, self.tree.loops, strict=True)
         )
         loops = Loops.of(groups, self.tree._replace(loops=passive))
-        J = np.asarray(_of_loops(motion, loops, q))
+        J = np.asarray(_of_loops(motion, loops, self.assembly.couplings, q))
         mass = eqx.filter_jit(TreeMass(ConstantAssembly(self.assembly), self.tree))(q, None)
         sizes, modes = np.linalg.eigh(mass)
         has_mass = sizes > _DEPENDENT * sizes.max()
@@ -189,9 +218,14 @@ class JointCoordinates(eqx.Module):
         if number == J.shape[0]:
             return None
         chosen = np.sort(order[:number])
+        # The equations of drives, which are all solved, are between those of loops and couplings.
         drives = sum(len(group.attachment.names) for group in groups if group.motions is not None)
         norms = motion.coordinates.quaternions().shape[0]
-        return (*chosen.tolist(), *range(J.shape[0], J.shape[0] + drives + norms))
+        joints = J.shape[0] - len(self.assembly.couplings.names)
+        of_loops, of_couplings = chosen[chosen < joints], chosen[chosen >= joints] + drives
+        rest = J.shape[0] + drives + np.arange(norms)
+        rows = [of_loops, joints + np.arange(drives), of_couplings, rest]
+        return tuple(np.concatenate(rows).tolist())
 
 
 # One program each, not one for each operation.
@@ -201,7 +235,9 @@ _frames = eqx.filter_jit(Frames.of)
 
 
 @eqx.filter_jit
-def _of_loops(motion: TreeMotion, loops: Loops, q: Float[Array, " n"]) -> Float[Array, "m n"]:
+def _of_loops(
+    motion: TreeMotion, loops: Loops, couplings: Couplings, q: Float[Array, " n"]
+) -> Float[Array, "m n"]:
     at = motion.place(q)
     rows = loops.jacobian(at, jnp.concatenate(motion.jacobians(at), axis=2))
-    return jnp.concatenate([jnp.zeros((0, q.size), q.dtype), *rows])
+    return jnp.concatenate([*rows, couplings.jacobian(motion.coordinates, q)])

@@ -45,7 +45,7 @@ Found = tuple[JointGroup, int]  # a joint: its group, and its place in the group
 
 def group_restraints(bodies: Bodies, given: Any) -> tuple[JointGroup, ...]:
     named = name_all(given, joints.AbstractRestraint, "joint")
-    of_joints = [pair for pair in named if not isinstance(pair[0], joints.Drive)]
+    of_joints = [pair for pair in named if isinstance(pair[0], joints.AbstractJoint)]
     kinds = grouped(of_joints, lambda joint, name: type(joint))
     groups = tuple(_group_joints(kind, bodies, *own) for kind, own in kinds.items())
     advice = "Drives belong to `Revolute` and `Prismatic` joints."

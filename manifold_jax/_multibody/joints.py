@@ -11,7 +11,7 @@ from .checks import as_pair, check_axis, check_shape, is_concrete
 
 
 class AbstractRestraint(eqx.Module):
-    """A restriction of the motion of bodies: a joint, or the drive of one."""
+    """A restriction of the motion of bodies: a joint, the drive of one, or the coupling of two."""
 
 
 class AbstractJoint(AbstractRestraint):
@@ -127,6 +127,39 @@ class Drive(AbstractRestraint):
 
     joint: str = eqx.field(static=True)
     motion: Any
+    name: str | None = eqx.field(static=True, default=None)
+
+
+class Coupling(AbstractRestraint):
+    """Gears, a mimic joint: the coordinate `x` of a hinge or slider is a polynomial in that of another, `z`,
+
+        x = c_1 z + c_2 z^2 + ...,
+
+    one equation. Both are zero in the drawing.
+
+    ```python
+    mb.Coupling("output", "input", -0.25)  # wheels that mesh, of 40 and 10 teeth
+    mb.Coupling("left finger", "right finger", 1.0)
+    ```
+
+    **Arguments:**
+
+    - `joint`, `other`: the names of [`Revolute`][] or [`Prismatic`][] joints, of `x` and of `z`.
+    - `coefficients`: the ratio `c_1`, or all `(c_1, c_2, ...)`; rad or m, per powers of rad or m.
+    - `name`: by default made from that of its joint.
+
+    The assembly must be solved in the coordinates of its joints, in which angles continue beyond `pi`, see
+    [`JointCoordinates`][]. Joints with couplings must not form a closed loop by themselves. One that does not move
+    at all has a [`Drive`][] instead, `Drive(joint, 0.0)`.
+
+    `Assembly` raises `ValueError` for a joint that does not exist or is of another kind.
+
+    Source: MuJoCo's XML reference, `equality/joint`; the specification of URDF, `mimic`.
+    """
+
+    joint: str = eqx.field(static=True)
+    other: str = eqx.field(static=True)
+    coefficients: Any
     name: str | None = eqx.field(static=True, default=None)
 
 

@@ -8,8 +8,7 @@ from .._base.types import Args
 from .._base.user_functions import AbstractOfArgs, check_function
 from .._mechanics import MechanicalSystem
 from .assembly import Assembly
-from .rotors import refuse_rotors
-from .system import system_of
+from .system import check_for_poses, system_of
 
 
 def parametrized(build: Callable, *, redundant: bool = False) -> MechanicalSystem:
@@ -41,7 +40,7 @@ class _Built(AbstractOfArgs):
             raise TypeError(
                 f"`build` must return an `mj.multibody.Assembly`, got {type(assembly).__name__}."
             )
-        refuse_rotors(assembly.rotors)
+        check_for_poses(assembly)
         if assembly.independent is not None:
             raise ValueError(
                 "`build` returns an assembly of `without_dependent_equations`: write `parametrized(build, redundant=True)` with the "

@@ -57,12 +57,3 @@ def _of_kind(hinge: bool, rotors: tuple, names: tuple[str, ...], found: tuple) -
 def names_of(rotors: tuple[Rotors, ...]) -> tuple[str, ...]:
     """Return the names of all joints with rotors."""
     return tuple(name for group in rotors for name in group.joints)
-
-
-def refuse_rotors(rotors: tuple[Rotors, ...]) -> None:
-    """Raise where there are rotors: they are no part of the mass matrix of bodies, which has a block for each."""
-    if rotors:
-        raise ValueError(
-            f"`RotorInertia` of the joints {list(names_of(rotors))[:12]} couples bodies, which is supported in the coordinates "
-            "of joints alone. Solve `mj.multibody.JointCoordinates(assembly)` instead of the assembly."
-        )

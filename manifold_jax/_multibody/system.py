@@ -12,10 +12,12 @@ from .._base.types import Args, RealScalarLike
 from .._base.user_functions import AbstractOfArgs
 from .._mechanics import AbstractPositions, MechanicalSystem
 from .bodies import Pose
+from .checks import is_concrete
 from .frames import Frames
 from .joint_groups import jacobian, residuals
 from .loads import add
 from .rotations import rates_matrix, turn_back
+from .rotors import names_of
 
 
 class ConstantAssembly(eqx.Module):
@@ -23,6 +25,23 @@ class ConstantAssembly(eqx.Module):
 
     def __call__(self, args: Args) -> Any:
         return self.assembly
+
+
+def check_for_poses(assembly: Any) -> None:
+    """Raise for what is no part of a system in the poses of bodies: its mass matrix has a nonsingular block for
+    each, and their angles end at `pi`."""
+    mass = assembly.bodies.mass
+    massless = np.flatnonzero(mass == 0) if is_concrete(mass) else ()
+    found = {
+        "`RotorInertia` of the joints": names_of(assembly.rotors),
+        "`Coupling`": assembly.couplings.names,
+        "bodies without mass,": tuple(assembly.bodies.names[i] for i in massless),
+    }
+    if listed := "; ".join(f"{what} {list(own)[:12]}" for what, own in found.items() if own):
+        raise ValueError(
+            f"The assembly has what is supported in the coordinates of joints alone: {listed}. Solve "
+            "`mj.multibody.JointCoordinates(assembly)` instead of the assembly."
+        )
 
 
 class _InverseInertia(AbstractOfArgs):

@@ -78,8 +78,8 @@ class TreeForces(eqx.Module):
 
 
 class LoopEquations(AbstractPositionsWithBias):
-    """The equations of the joints that close loops, of drives, and the norms of quaternions: all, or those
-    of the given numbers."""
+    """The equations of the joints that close loops, of drives, of couplings, and the norms of quaternions: all, or
+    those of the given numbers."""
 
     source: Callable
     tree: SpanningTree = eqx.field(static=True)
@@ -90,6 +90,7 @@ class LoopEquations(AbstractPositionsWithBias):
         motion = motion_of(assembly, self.tree)
         loops = Loops.of(assembly.joints_at(t, args), self.tree)
         parts = [part.reshape(-1) for part in loops.residuals(motion.place(q))]
+        parts.append(assembly.couplings.residual(motion.coordinates, q))
         p = q[motion.coordinates.quaternions()]
         parts.append((jnp.sum(p * p, axis=1) - 1) / 2)
         found = jnp.concatenate(parts)
@@ -103,7 +104,8 @@ class LoopEquations(AbstractPositionsWithBias):
         J = jnp.concatenate(motion.jacobians(at), axis=2)
         norms = jnp.zeros((numbers.shape[0], q.size), q.dtype)
         norms = norms.at[np.arange(numbers.shape[0])[:, None], numbers].set(q[numbers])
-        rows = jnp.concatenate([*loops.jacobian(at, J), norms])
+        coupled = assembly.couplings.jacobian(motion.coordinates, q)
+        rows = jnp.concatenate([*loops.jacobian(at, J), coupled, norms])
         return rows if self.rows is None else rows[np.array(self.rows)]
 
     def bias(
@@ -126,7 +128,8 @@ class LoopEquations(AbstractPositionsWithBias):
         t, now = jnp.asarray(t, q.dtype), jnp.zeros((), q.dtype)
         _, found = jax.jvp(rate, (t, now), (jnp.ones_like(t), jnp.ones_like(now)))
         norms = jnp.sum(v[numbers] ** 2, axis=1)
-        rows = jnp.concatenate([*(part.reshape(-1) for part in found), norms])
+        coupled = assembly.couplings.bias(motion.coordinates, q, v)
+        rows = jnp.concatenate([*(part.reshape(-1) for part in found), coupled, norms])
         return rows if self.rows is None else rows[np.array(self.rows)]
 
 
