@@ -25,7 +25,7 @@ def accelerations(robot, y, args):
 def those_of_mujoco(robot, model, data):
     mujoco.mj_rnePostConstraint(model, data)
     both, kind, rows = np.zeros(6), mujoco.mjtObj.mjOBJ_BODY, []
-    for name in robot.names:
+    for name in named_by_file(robot):
         i = mujoco.mj_name2id(model, kind, name)
         mujoco.mj_objectAcceleration(model, data, kind, i, both, 0)
         rows.append(both.copy())
@@ -33,14 +33,23 @@ def those_of_mujoco(robot, model, data):
     return rows[:, 3:] + model.opt.gravity, rows[:, :3]
 
 
+def named_by_file(robot):
+    """The bodies of the file, without links between joints of one body."""
+    return [name for name in robot.names if "(" not in name]
+
+
 class RandomTree:
     """MJCF of a tree with every joint that is read, in random places."""
 
-    def __init__(self, seed, armature=False):  # and damped ball joints
+    def __init__(
+        self, seed, armature=False
+    ):  # damped ball joints, too, and bodies with several joints
         self.armature = armature
         self.rng = np.random.default_rng(seed)
         types = ["hinge", "slide", "ball", "universal", "cylindrical", "none"]
         self.types = [str(t) for t in self.rng.permutation(types)] + ["free", "hinge"]
+        if armature:
+            self.types[0] = "several"
         self.parents = [-1] + [int(self.rng.integers(-1, i)) for i in range(1, 6)] + [-1, 6]
 
     def numbers(self, size=1.0, n=3):
@@ -51,6 +60,12 @@ class RandomTree:
 
     def joint(self, i):
         kind, at = self.types[i], self.numbers(0.3)
+        if kind == "several":
+            return "".join(self.joint_of_type(*part) for part in SEVERAL)
+        return self.joint_of_type(kind, i, at)
+
+    def joint_of_type(self, kind, i, at=None):
+        at = self.numbers(0.3) if at is None else at
         if kind in ("hinge", "slide"):
             spring = f'stiffness="{self.positive(0, 2)}" springref="{self.positive(-0.3, 0.3)}"'
             spring += f' damping="{self.positive(0, 0.5)}"'
@@ -89,13 +104,16 @@ class RandomTree:
         motors = "".join(
             f'<motor joint="j{i}" gear="{self.positive(0.5, 2)}" ctrllimited="true" ctrlrange="-1 1"/>'
             f'<position joint="j{i}" kp="{self.positive(0.5, 2)}"/>'
-            for i, kind in enumerate(self.types)
+            for kind, i in [*zip(self.types, range(8)), *(SEVERAL if self.armature else ())]
             if kind in ("hinge", "slide")
         )
         return (
             f'<mujoco><option gravity="{self.numbers(5)}"/><worldbody>{bodies}</worldbody>'
             f"<actuator>{motors}</actuator></mujoco>"
         )
+
+
+SEVERAL = ("slide", "a"), ("hinge", "b"), ("hinge", "c"), ("ball", "d")
 
 
 @eqx.filter_jit
@@ -106,8 +124,9 @@ def accelerations_by_joints(robot, y, args):
 
     def rates(y):
         poses = joints.poses(y)
-        spins = [robot.motion(poses, name).angular_velocity for name in robot.names]
-        return poses[1].position, jnp.stack(spins)
+        motions = [robot.motion(poses, name) for name in named_by_file(robot)]
+        parts = zip(*((motion.velocity, motion.angular_velocity) for motion in motions))
+        return tuple(jnp.stack(part) for part in parts)
 
     return eqx.filter_jvp(rates, ((q, v),), (ahead,))[1]
 
@@ -130,6 +149,67 @@ def test_accelerations_of_random_trees(seed, armature):
     for ours, theirs in zip(actual, those_of_mujoco(robot, model, data)):
         assert np.abs(theirs).max() > 1
         np.testing.assert_allclose(ours, theirs, rtol=0, atol=1e-11)
+
+
+COUPLED = """<mujoco><worldbody><body name="base">
+ <joint name="lift" type="slide" axis="0 0 1" armature="0.3" ref="0.2"/>
+ <joint name="turn" pos="0.1 0 0" axis="0 1 0.2"/>
+ <joint name="lean" axis="1 0 0" stiffness="2"/>
+ <inertial pos="0.1 0.2 0" mass="2" diaginertia="0.3 0.4 0.5"/>
+ <body name="finger" pos="0.3 0 0"><joint name="curl" axis="0 0 1"/><inertial pos="0.2 0 0.1" mass="1" diaginertia="0.1 0.2 0.2"/></body>
+ <body name="thumb" pos="0 0.3 0"><joint name="bend" axis="0 1 0" ref="30"/><inertial pos="0.2 0.1 0" mass="1" diaginertia="0.1 0.1 0.1"/></body>
+ <body name="nail" pos="0 0.3 0.1"><joint name="locked"/><inertial pos="0.2 0.1 0" mass="1" diaginertia="0.1 0.1 0.1"/></body>
+</body></worldbody><equality>
+ <joint name="second" joint1="bend" joint2="turn" polycoef="-0.1 0.7 0 -0.4 0"/>
+ <joint name="first" joint1="turn" joint2="lift" polycoef="0.3 1.5 -2 0 1"/>
+ <joint name="lock" joint1="locked" polycoef="0.2 0 0 0 0"/>
+</equality></mujoco>"""
+
+
+def test_coupled_joints():
+    """Accelerations are those of a linear system of MuJoCo's mass matrix and forces, solved by NumPy."""
+    model = mujoco.MjModel.from_xml_string(COUPLED)
+    robot = mb.from_mujoco(model)
+    joints = mb.JointCoordinates(robot)
+    names = [model.joint(j).name for j in range(model.njnt)]
+    assert joints.names == tuple(names)
+    data, rng = mujoco.MjData(model), np.random.default_rng(0)
+    turn, bend = (np.polynomial.Polynomial(c) for c in ([0.3, 1.5, -2, 0, 1], [-0.1, 0.7, 0, -0.4]))
+    z, w = rng.normal(scale=0.3, size=3), rng.normal(size=3)
+    x = np.array([z[0], turn(z[0]), z[1], z[2], bend(turn(z[0])), 0.2])  # from `qpos0`
+    data.qpos[:] = model.qpos0 + x
+    slopes = turn.deriv()(z[0]), bend.deriv()(x[1])
+    v = np.array([w[0], slopes[0] * w[0], w[1], w[2], slopes[0] * slopes[1] * w[0], 0])
+    data.qvel[:] = v
+    y = mb.state_of_mujoco(robot, model, data)
+    assert max(np.abs(gap).max() for gap in robot.gaps(y[0]).values()) < 1e-14
+    start = x - np.array([0, turn(0), 0, 0, bend(turn(0)), 0.2])  # from the drawing
+    q = joints.state(y)[0]
+    np.testing.assert_allclose(q, start, rtol=0, atol=1e-14)
+    np.testing.assert_allclose(joints.state(y)[1], v, rtol=0, atol=1e-13)
+    M = np.zeros((6, 6))
+    for column, unit in zip(M, np.eye(6)):
+        mujoco.mj_mulM(model, data, column, unit)
+    J, rest = np.zeros((3, 6)), np.zeros(3)
+    J[0, [1, 0]], rest[0] = (1, -slopes[0]), turn.deriv(2)(x[0]) * v[0] ** 2
+    J[1, [4, 1]], rest[1] = (1, -slopes[1]), bend.deriv(2)(x[1]) * v[1] ** 2
+    J[2, 5] = 1
+    kkt = np.block([[M, J.T], [J, np.zeros((3, 3))]])
+    force = data.qfrc_passive - data.qfrc_bias
+    expected = np.linalg.solve(kkt, np.concatenate([force, rest]))[:6]
+    actual = eqx.filter_jit(joints.system.accelerations)(0.0, (q, jnp.asarray(v)), None)
+    np.testing.assert_allclose(actual, expected, rtol=0, atol=1e-11)
+    with pytest.raises(
+        ValueError, match=r"`Coupling` \['second', 'first'\]; bodies without mass.*`mj.multi"
+    ):
+        robot.system  # noqa: B018
+    with pytest.raises(
+        ValueError, match=r"couplings of joints \['second', 'first', 'lock', 'other'\] contra"
+    ):
+        mb.from_mujoco(COUPLED.replace("</equality>", CONTRADICTION))
+
+
+CONTRADICTION = '<joint name="other" joint1="turn" joint2="lift" polycoef="0 1 0 0 0"/></equality>'
 
 
 def test_a_loop_closed_by_an_equality():
@@ -193,6 +273,8 @@ BODY = """<mujoco><worldbody><body name="bob">{}<geom name="ball" size="0.1" {}/
 </worldbody>{}</mujoco>"""
 FREE = '<joint name="j"/>'
 QUIET = 'contype="0"'
+COUPLED_TENDON = """<tendon><fixed name="rope"><joint joint="j" coef="1"/></fixed></tendon>
+<equality><tendon name="belt" tendon1="rope"/></equality>"""
 
 
 @pytest.mark.parametrize(
@@ -211,8 +293,8 @@ QUIET = 'contype="0"'
             "tendon: rope",
         ),
         (
-            (FREE, QUIET, "", '<equality><joint name="gears" joint1="j"/></equality>'),
-            "equality of type joint: gears",
+            (FREE, QUIET, "", COUPLED_TENDON),
+            "tendon: rope; equality of type tendon: belt",
         ),
         (
             (FREE, QUIET, "", '<actuator><general name="lag" joint="j" dyntype="filter"/></actuator>'),
@@ -221,10 +303,6 @@ QUIET = 'contype="0"'
         (
             (FREE, QUIET, '<body name="m" mocap="true"/>', ""),
             "mocap body",
-        ),
-        (
-            ('<joint name="j"/><joint name="k" pos="1 0 0"/>', QUIET, "", ""),
-            r"'bob' has the joints 'j k' \(hinge, hinge\)",
         ),
     ],
 )  # fmt: skip

@@ -28,6 +28,7 @@ from .joints import (
     Spherical as Spherical,
     Universal as Universal,
 )
-from .mujoco import from_mujoco as from_mujoco, state_of_mujoco as state_of_mujoco
+from .mujoco import from_mujoco as from_mujoco
+from .mujoco_state import state_of_mujoco as state_of_mujoco
 from .rotations import quaternion as quaternion
 from .urdf import read_urdf as read_urdf, Robot as Robot

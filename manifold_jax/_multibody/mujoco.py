@@ -12,12 +12,11 @@ from jaxtyping import Array, Float
 from .._base.types import Args, RealScalarLike
 from .._base.user_functions import check_function
 from .assembly import Assembly
-from .bodies import Pose
 from .checks import floating
 from .forces import AbstractForce, JointSpring, Motor, RotationalDamper, RotorInertia
 from .mujoco_checks import actuator_fault, disabled, import_mujoco, refuse_unsupported
-from .mujoco_tree import quaternion_of, Tree
-from .rotations import quaternion_rate
+from .mujoco_state import drawing_of
+from .mujoco_tree import Tree
 
 
 def from_mujoco(
@@ -41,12 +40,16 @@ def from_mujoco(
         `("contact", "joint limit")`.
     - `redundant`: as for [`Assembly`][].
 
-    Read are bodies with their inertias; hinge, slide, ball and free joints, two hinges with
-    perpendicular axes through one point (a universal joint), hinge and slide on one axis (a
-    cylindrical one); stiffness, damping and armature of hinges and slides (with armature solve
-    [`JointCoordinates`][] of the result, see [`RotorInertia`][]), damping of ball joints; `equality` of the types connect and
-    weld; gravity; actuators of joints with constant gain and affine bias (motor, position, velocity,
-    damper). The drawing is the pose `qpos0`. Stiffness of hinges counts angles from `-pi` to `pi`.
+    Read are bodies with their inertias and any number of hinge, slide and ball joints each, or a free one;
+    stiffness, damping and armature of hinges and slides, damping of ball joints; `equality` of the types connect,
+    weld and joint; gravity; actuators of hinges and slides with constant gain and affine bias (motor, position,
+    velocity, damper). The drawing is the pose `qpos0`, with coupled joints where their couplings have them.
+    Stiffness of hinges counts angles from `-pi` to `pi`.
+
+    A body with several joints hangs on links without mass, `"torso (rootx)"` is the one of the body torso that its
+    joint rootx moves. These, armature and couplings of joints need the coordinates of joints: solve
+    [`JointCoordinates`][] of the result. But two perpendicular hinges through one point are a universal
+    joint, and hinge and slide on one axis a cylindrical one, if nothing acts on one of them alone.
 
     **Raises** `ValueError` with the names of all elements that are not supported: tendons, contacts,
     limits, friction, and so on. Elements without effect on the motion (geometries that do not
@@ -57,10 +60,7 @@ def from_mujoco(
     refuse_unsupported(mujoco, model, ignore)
     if control is not None:
         check_function("control", control, "f(t, args)")
-    drawing = mujoco.MjData(model)
-    mujoco.mj_kinematics(model, drawing)
-    mujoco.mj_comPos(model, drawing)
-    tree = Tree(mujoco, model, drawing)
+    tree = Tree(mujoco, model, drawing_of(mujoco, model))
     gravity = np.zeros(3) if disabled(mujoco, model, "GRAVITY") else model.opt.gravity
     bodies, joints = tree.bodies(), tree.joints()
     if not bodies:
@@ -74,22 +74,6 @@ def from_mujoco(
         gravity=gravity,
         redundant=redundant,
     )
-
-
-def state_of_mujoco(assembly: Assembly, model: Any, data: Any) -> tuple[Pose, Pose]:
-    """Return the state `(q, v)` of an assembly of [`from_mujoco`][] for `qpos` and `qvel` in MuJoCo's
-    `data`. Calls `mj_forward` on it."""
-    mujoco = import_mujoco()
-    mujoco.mj_forward(model, data)
-    rows, kind, both = [], mujoco.mjtObj.mjOBJ_BODY, np.zeros(6)
-    for name in assembly.names:
-        i = mujoco.mj_name2id(model, kind, name)
-        i = int(name.removeprefix("body ")) if i < 0 else i
-        mujoco.mj_objectVelocity(model, data, kind, i, both, 0)
-        orientation = quaternion_of(mujoco, data.ximat[i])
-        rows.append((data.xipos[i].copy(), orientation, both[3:].copy(), both[:3].copy()))
-    x, p, moving, spins = (floating(np.stack(part)) for part in zip(*rows, strict=True))
-    return Pose(x, p), Pose(moving, quaternion_rate(p, spins))
 
 
 def load(mujoco: Any, model: Any) -> Any:
@@ -111,7 +95,7 @@ def _passive_forces(tree: Tree) -> list[AbstractForce]:
         stiffness, damping = model.jnt_stiffness[j], model.dof_damping[model.jnt_dofadr[j]]
         at = model.jnt_qposadr[j]
         if stiffness != 0 or damping != 0:
-            rest = model.qpos_spring[at] - model.qpos0[at]
+            rest = model.qpos_spring[at] - tree.drawing.qpos[at]
             found.append(JointSpring(name, stiffness, rest, damping))  # pyright: ignore[reportArgumentType]
         if (armature := model.dof_armature[model.jnt_dofadr[j]]) != 0:
             found.append(RotorInertia(name, armature))  # pyright: ignore[reportArgumentType, reportCallIssue]
@@ -143,7 +127,7 @@ def _group_disabled(model: Any, i: int) -> bool:
 def _actuator(tree: Tree, control: Callable | None, i: int) -> list[AbstractForce]:
     model = tree.model
     joint, name = tree.joint_of[model.actuator_trnid[i, 0]], tree.name("actuator", i)
-    zero = float(model.qpos0[model.jnt_qposadr[model.actuator_trnid[i, 0]]])
+    zero = float(tree.drawing.qpos[model.jnt_qposadr[model.actuator_trnid[i, 0]]])
     gear, gain = float(model.actuator_gear[i, 0]), float(model.actuator_gainprm[i, 0])
     affine = int(tree.mujoco.mjtBias.mjBIAS_AFFINE)
     bias = model.actuator_biasprm[i, :3] * (model.actuator_biastype[i] == affine)

@@ -36,7 +36,6 @@ OTHERS = (
     "damping of several coordinates",
     "stiffness of several coordinates",
     "armature of several coordinates",
-    "moving body without mass",
     "actuator that is not of a joint",
     "actuator of several coordinates",
     "actuator gain that is not constant",
@@ -124,8 +123,7 @@ def disabled(mujoco: Any, model: Any, flag: str) -> bool:
 
 def _with_one_coordinate(mujoco: Any, model: Any, joint: Index) -> bool:
     kinds = {int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)}
-    alone = int(model.body_jntnum[model.jnt_bodyid[joint]]) == 1
-    return alone and int(model.jnt_type[joint]) in kinds
+    return int(model.jnt_type[joint]) in kinds
 
 
 def _forces_of_joints(mujoco: Any, model: Any) -> Iterator[tuple[str, str]]:
@@ -143,9 +141,6 @@ def _forces_of_joints(mujoco: Any, model: Any) -> Iterator[tuple[str, str]]:
             yield "armature of several coordinates", name
         if model.jnt_stiffness[joint] != 0:
             yield "stiffness of several coordinates", name
-    for i in range(1, model.nbody):
-        if model.body_mass[i] == 0 and model.body_jntnum[i] > 0:
-            yield "moving body without mass", name_of(mujoco, model, "body", i)
 
 
 def actuator_fault(mujoco: Any, model: Any, i: Index) -> str | None:
@@ -164,7 +159,8 @@ def actuator_fault(mujoco: Any, model: Any, i: Index) -> str | None:
 
 
 def equality_fault(mujoco: Any, model: Any, e: Index) -> str | None:
-    known = {int(mujoco.mjtEq.mjEQ_CONNECT), int(mujoco.mjtEq.mjEQ_WELD)}
+    names = "CONNECT", "WELD", "JOINT"
+    known = {int(getattr(mujoco.mjtEq, f"mjEQ_{name}")) for name in names}
     kind = int(model.eq_type[e])
     if kind in known:
         return None

@@ -31,7 +31,7 @@ def check_for_poses(assembly: Any) -> None:
     """Raise for what is no part of a system in the poses of bodies: its mass matrix has a nonsingular block for
     each, and their angles end at `pi`."""
     mass = assembly.bodies.mass
-    massless = np.flatnonzero(mass == 0) if is_concrete(mass) else ()
+    massless = np.flatnonzero(np.asarray(mass) == 0) if is_concrete(mass) else ()
     found = {
         "`RotorInertia` of the joints": names_of(assembly.rotors),
         "`Coupling`": assembly.couplings.names,
