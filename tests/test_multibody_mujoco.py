@@ -49,7 +49,7 @@ class RandomTree:
         types = ["hinge", "slide", "ball", "universal", "cylindrical", "none"]
         self.types = [str(t) for t in self.rng.permutation(types)] + ["free", "hinge"]
         if armature:
-            self.types[0] = "several"
+            self.types[0] = self.types[7] = "several"
         self.parents = [-1] + [int(self.rng.integers(-1, i)) for i in range(1, 6)] + [-1, 6]
 
     def numbers(self, size=1.0, n=3):
@@ -61,7 +61,7 @@ class RandomTree:
     def joint(self, i):
         kind, at = self.types[i], self.numbers(0.3)
         if kind == "several":
-            return "".join(self.joint_of_type(*part) for part in SEVERAL)
+            return "".join(self.joint_of_type(*part) for part in several(i))
         return self.joint_of_type(kind, i, at)
 
     def joint_of_type(self, kind, i, at=None):
@@ -99,12 +99,17 @@ class RandomTree:
         children = "".join(self.body(k) for k, parent in enumerate(self.parents) if parent == i)
         return f"<body {place}>{self.joint(i)}{inertial}{children}</body>"
 
+    def numbered_joints(self):
+        """The types and numbers of all joints."""
+        for i, kind in enumerate(self.types):
+            yield from several(i) if kind == "several" else ((kind, i),)
+
     def xml(self):
         bodies = "".join(self.body(i) for i, parent in enumerate(self.parents) if parent == -1)
         motors = "".join(
             f'<motor joint="j{i}" gear="{self.positive(0.5, 2)}" ctrllimited="true" ctrlrange="-1 1"/>'
             f'<position joint="j{i}" kp="{self.positive(0.5, 2)}"/>'
-            for kind, i in [*zip(self.types, range(8)), *(SEVERAL if self.armature else ())]
+            for kind, i in self.numbered_joints()
             if kind in ("hinge", "slide")
         )
         return (
@@ -113,7 +118,10 @@ class RandomTree:
         )
 
 
-SEVERAL = ("slide", "a"), ("hinge", "b"), ("hinge", "c"), ("ball", "d")
+def several(i):
+    """The types and numbers of the joints of one body: the first behind the one with all coordinates."""
+    last = () if i == 7 else (("ball", f"{i}d"),)
+    return ("slide", f"{i}a"), ("hinge", f"{i}b"), ("hinge", f"{i}c"), *last
 
 
 @eqx.filter_jit

@@ -70,30 +70,26 @@ def state_of_mujoco(assembly: Assembly, model: Any, data: Any) -> tuple[Pose, Po
     mujoco.mj_forward(model, data)
     chains = [link_names(mujoco, model, i) for i in range(model.nbody)]
     known = {name: (i, k) for i, chain in enumerate(chains) for k, name in enumerate(chain)}
-    rest, reached, rows = drawing_of(mujoco, model), {}, []
+    rest, rows = drawing_of(mujoco, model), []
     for name in assembly.names:
         i, place = known[name]
         behind = len(chains[i]) - 1 - place  # joints between the link and the body
-        if behind not in reached:
-            reached[behind] = _without_last_joints(mujoco, model, data, rest, behind)
-        rows.append(_motion(mujoco, model, reached[behind], i))
+        moved = _without_last_joints(mujoco, model, data, rest, i, behind) if behind else data
+        rows.append(_motion(mujoco, model, moved, i))
     x, p, moving, spins = (floating(np.stack(part)) for part in zip(*rows, strict=True))
     return Pose(x, p), Pose(moving, quaternion_rate(p, spins))
 
 
-def _without_last_joints(mujoco: Any, model: Any, data: Any, rest: Any, number: int) -> Any:
-    """Return data in which so many last joints of every body are at rest as in the drawing: its bodies move as the
-    links before those joints."""
-    if number == 0:
-        return data
+def _without_last_joints(mujoco: Any, model: Any, data: Any, rest: Any, i: int, number: int) -> Any:
+    """Return data in which so many last joints of body `i` are at rest as in the drawing: it moves as the link
+    before those joints."""
     moved = mujoco.MjData(model)
     moved.qpos[:], moved.qvel[:] = data.qpos, data.qvel
-    for i in range(model.nbody):
-        end = model.body_jntadr[i] + model.body_jntnum[i]
-        for j in range(max(model.body_jntadr[i], end - number), end):
-            of_positions = _entries(model.jnt_qposadr, j, model.nq)
-            moved.qpos[of_positions] = rest.qpos[of_positions]
-            moved.qvel[_entries(model.jnt_dofadr, j, model.nv)] = 0
+    end = model.body_jntadr[i] + model.body_jntnum[i]
+    for j in range(end - number, end):
+        of_positions = _entries(model.jnt_qposadr, j, model.nq)
+        moved.qpos[of_positions] = rest.qpos[of_positions]
+        moved.qvel[_entries(model.jnt_dofadr, j, model.nv)] = 0
     mujoco.mj_fwdPosition(model, moved)
     mujoco.mj_fwdVelocity(model, moved)
     return moved
