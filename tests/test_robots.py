@@ -169,6 +169,28 @@ def test_a_free_base_falls():
     np.testing.assert_allclose(falling, [0, 0, -9.81], atol=1e-10)
 
 
+def test_a_joint_that_mimics_another():
+    """A crank with a motor, and a slider that mimics it, `x = 0.5 z - 0.1`: accelerations from the sum of the
+    energies of both."""
+    mimic = '<mimic joint="turn" multiplier="0.5" offset="-0.1"/>'
+    file = f"""<robot name="press">{cases.link("base")}{cases.link("crank", 0.5, 0.2)}{cases.link("ram", 2.0, 0.1)}
+    {cases.joint("turn", "continuous", "base", "crank")}
+    {cases.joint("push", "prismatic", "base", "ram", more=mimic)}</robot>"""
+    given = {"closures": {"name_mot": ["turn"]}, "control": lambda t, args: args}
+    robot = mb.read_urdf(file, configuration={"turn": 0.8}, gravity=(0.0, 0.0, 0.0), **given)
+    assert abs(robot.configuration["push"] - 0.3) < 1e-15
+    joints = mb.JointCoordinates(robot.assembly)
+    still = jax.tree.map(jnp.zeros_like, joints.state())
+    found = eqx.filter_jit(joints.system.accelerations)(0.0, still, jnp.array([0.7]))
+    expected = 0.7 / (0.2 + 0.5**2 * 2.0) * np.array([1, 0.5])
+    np.testing.assert_allclose(found, expected, rtol=1e-13)
+    assert not mb.read_urdf(file, ignore=("mimic",), **given).assembly.couplings.names
+    with pytest.raises(ValueError, match="Joints cannot mimic others as `file` says"):
+        mb.read_urdf(file, configuration={"turn": 0.8, "push": 0.0}, **given)
+    with pytest.raises(ValueError, match=r"<mimic> of 'push' needs .*\['arm'\] have not"):
+        mb.read_urdf(file.replace('mimic joint="turn"', 'mimic joint="arm"'), **given)
+
+
 CHANGES = {  # of the file and the arguments, and what is said
     "gap": (
         ("0 0 0.4", "0 0 1.4"),

@@ -44,6 +44,16 @@ class KinematicTree:
         self.size = int(starts[-1])
         self.rest = {joint.name: joint.rest for joint in self.order}
 
+    def mimics(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return `A` and `b` of the equations `A x = b` of joints that mimic others."""
+        pairs = [(joint, joint.mimic) for joint in self.order if joint.mimic is not None]
+        matrix, offset = np.zeros((len(pairs), self.size)), np.zeros(len(pairs))
+        for row, (joint, mimic) in enumerate(pairs):
+            matrix[row, self.columns[joint.name][0]] = 1
+            matrix[row, self.columns[mimic.other][0]] -= mimic.multiplier
+            offset[row] = mimic.offset
+        return matrix, offset
+
     def place(
         self, x: np.ndarray
     ) -> tuple[dict[str, Placement], list[tuple[bool, np.ndarray, np.ndarray]]]:

@@ -32,8 +32,8 @@ class Closure(NamedTuple):
 def close_loops(
     tree: KinematicTree, closures: Sequence[Closure], x: np.ndarray, held: Sequence[int]
 ) -> np.ndarray:
-    """Return coordinates for which all loops are closed, found from `x` or, where that fails, from starts
-    beside it; those `held` stay."""
+    """Return coordinates for which all loops are closed and that mimic others as they should, found from `x` or,
+    where that fails, from starts beside it; those `held` stay."""
     free = np.setdiff1d(np.arange(tree.size), held)
     random, rest = np.random.default_rng(0), tree.rest
     found, trial = [], x
@@ -80,7 +80,8 @@ def _gaps(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return all gaps and their derivatives by the coordinates."""
     placed, axes = tree.place(x)
-    gaps, rows = [np.zeros(0)], [np.zeros((0, tree.size))]
+    matrix, offset = tree.mimics()
+    gaps, rows = [matrix @ x - offset], [matrix]
     for closure in closures:
         gap = closure_gap(placed, closure)
         J = np.zeros((12, tree.size))
@@ -106,6 +107,12 @@ def closure_gap(placed: Mapping[str, Placement], closure: Closure) -> np.ndarray
 
 def _check_closed(tree: KinematicTree, closures: Sequence[Closure], x: np.ndarray) -> None:
     placed, _ = tree.place(x)
+    matrix, offset = tree.mimics()
+    if np.abs(matrix @ x - offset).max(initial=0) > _CLOSED:
+        raise ValueError(
+            "Joints cannot mimic others as `file` says. Check `configuration`, and <mimic> with loops in `closures`, or leave it "
+            "out by `ignore=('mimic',)`."
+        )
     sizes = [(np.abs(closure_gap(placed, closure)).max(), closure.name) for closure in closures]
     if open_ := sorted((pair for pair in sizes if not pair[0] <= _CLOSED), reverse=True):
         worst = ", ".join(f"{name} (gap {size:.3g})" for size, name in open_[:5])

@@ -6,22 +6,26 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array
 
-from .._base.types import Args, RealScalarLike
-from .._base.user_functions import check_function
 from .assembly import Assembly
 from .ball_joints import merge_hinges
 from .bodies import GROUND, Pose
-from .checks import check_shape, floating
+from .checks import check_shape
 from .closures import motions_of, read_additions
-from .forces import AbstractForce, JointSpring, Motor
-from .joints import AbstractJoint, AbstractRestraint, Prismatic, Revolute, Spherical
+from .forces import AbstractForce
+from .joints import (
+    AbstractJoint,
+    AbstractRestraint,
+    Coupling,
+    Spherical,
+)
 from .kinematic_tree import KinematicTree
 from .loops import close_loops, Closure
 from .rigid_groups import body_names, connections, Groups, joint_between
 from .rotations import rotation_matrix
 from .urdf_elements import Joint, Placement, read_elements
+from .urdf_forces import dampers_of, motors_of
 
 
 class LinkFrame(NamedTuple):
@@ -107,31 +111,35 @@ def read_urdf(
         for none.
     - `joints`, `forces`: further ones for the [`Assembly`][], such as [`Drive`][] and [`Motor`][].
     - `gravity` (m/s^2).
-    - `ignore`: what is not supported, to leave it out: some of `("friction", "mimic")`.
+    - `ignore`: what to leave out, some of `("friction", "mimic")`: Coulomb friction is not supported; joints
+        that mimic others are a [`Coupling`][] with them, which needs [`JointCoordinates`][].
 
     **Returns:** a [`Robot`][].
 
     **Raises** `ValueError` with the names in the file: for loops that cannot be closed and their gaps (m or
-    rad), links without mass where it is needed, inertias that no body has, Coulomb friction and joints
-    that mimic others unless ignored. `from_mujoco` reads URDF, too, without loops.
+    rad), links without mass where it is needed, inertias that no body has, Coulomb friction unless ignored.
+    `from_mujoco` reads URDF, too, without loops.
     """
     links, elements = read_elements(file)
-    _refuse_unsupported(elements, ignore)
+    elements = _supported(elements, ignore)
     additions = read_additions(closures, links, elements)
-    links, elements = merge_hinges(links, elements, additions.used)
+    mimics = {name for j in elements if j.mimic for name in (j.name, j.mimic.other)}
+    links, elements = merge_hinges(links, elements, additions.used | mimics)
     motions = {joint.name: motions_of(joint, additions.joint_types) for joint in elements}
     tree = KinematicTree(links, elements, motions)
+    _check_mimics(tree)
     x = _closed(tree, additions.closures, configuration or {})
     placed, axes = tree.place(x)
     groups = Groups(tree, additions.closures, placed)
     names = body_names(groups, tree.root, floating_base)
     own = [joint_between(c, names) for c in connections(tree, groups, axes)]
     own += _ball_joints(additions.closures, groups, names, placed)
-    acting = _dampers(elements, own) + _motors(additions.motors, own, control)
+    acting = dampers_of(elements, own) + motors_of(additions.motors, own, control)
     bodies = [groups.body(group) for group in names if names[group] != GROUND]
     if not bodies:
         raise ValueError("`file` has no link with mass that moves.")
-    assembly = Assembly(bodies, [*own, *joints], [*acting, *forces], gravity=gravity)
+    joints = [*own, *_couplings(tree), *joints]
+    assembly = Assembly(bodies, joints, [*acting, *forces], gravity=gravity)
     return Robot(
         assembly.without_dependent_equations(),
         _coordinates(tree, x),
@@ -152,18 +160,39 @@ def _frames(
     }
 
 
-def _refuse_unsupported(joints: Sequence[Joint], ignore: Sequence[str]) -> None:
+def _supported(joints: Sequence[Joint], ignore: Sequence[str]) -> list[Joint]:
+    """Return the joints without what is to be ignored."""
     if unknown := sorted(set(ignore) - {"friction", "mimic"}):
         raise ValueError(f"`ignore` has {unknown}; known are 'friction' and 'mimic'.")
-    faults = {
-        "friction": [joint.name for joint in joints if joint.friction != 0],
-        "mimic": [joint.name for joint in joints if joint.mimics],
-    }
-    for word, names in faults.items():
-        if names and word not in ignore:
+    rubbing = [joint.name for joint in joints if joint.friction != 0]
+    if rubbing and "friction" not in ignore:
+        raise ValueError(
+            f"`file` has joints with <friction>, which is not supported: {', '.join(rubbing[:10])}. Leave it out by "
+            "`ignore=('friction',)`, or change the file."
+        )
+    if "mimic" in ignore:
+        return [joint._replace(mimic=None) for joint in joints]
+    return list(joints)
+
+
+def _couplings(tree: KinematicTree) -> list[Coupling]:
+    """Return the couplings of joints that mimic others; offsets are in the drawing."""
+    return [
+        Coupling(
+            joint.name, joint.mimic.other, joint.mimic.multiplier, name=f"mimic of {joint.name}"
+        )
+        for joint in tree.order
+        if joint.mimic is not None
+    ]
+
+
+def _check_mimics(tree: KinematicTree) -> None:
+    single = {name for name, own in tree.columns.items() if len(own) == 1}
+    for joint in tree.order:
+        if joint.mimic is not None and (bad := {joint.name, joint.mimic.other} - single):
             raise ValueError(
-                f"`file` has joints with <{word}>, which is not supported: {', '.join(names[:10])}. Leave it out by "
-                f"`ignore=({word!r},)`, or change the file."
+                f"`file`: <mimic> of {joint.name!r} needs two joints with one coordinate each; {sorted(bad)} have not, or are "
+                "not there."
             )
 
 
@@ -210,55 +239,3 @@ def _ball_joints(
             raise ValueError(f"The loop {closure.name} connects {bodies[0]!r} with itself.")
         found.append(Spherical(*bodies, at=placed[closure.first].origin, name=closure.name))
     return found
-
-
-def _dampers(elements: Sequence[Joint], joints: Sequence[AbstractJoint]) -> list[AbstractForce]:
-    single = {joint.name for joint in joints if isinstance(joint, Revolute | Prismatic)}
-    damped = [joint for joint in elements if joint.damping != 0]
-    if lost := [joint.name for joint in damped if joint.name not in single]:
-        raise ValueError(
-            f"`file` gives damping to {', '.join(lost)}, which is part of a joint with several coordinates or does not "
-            "move. Remove it, and add a `Damper` or `Torque` by `forces`."
-        )
-    found: list[Any] = [
-        JointSpring(joint.name, damping=joint.damping, name=f"damping of {joint.name}")  # pyright: ignore[reportCallIssue]
-        for joint in damped
-    ]
-    return found
-
-
-def _motors(
-    motors: tuple[str, ...], joints: Sequence[AbstractJoint], control: Callable | None
-) -> list[AbstractForce]:
-    if control is None:
-        return []
-    check_function("control", control, "f(t, args)")
-    if not motors:
-        raise ValueError(
-            "`control` needs motors: name their joints in `closures`, {'name_mot': [...]}."
-        )
-    single = {joint.name for joint in joints if isinstance(joint, Revolute | Prismatic)}
-    if passive := [name for name in motors if name not in single]:
-        raise ValueError(
-            f"`closures`: 'name_mot' has {passive}, which have no single coordinate for a torque or force: motors belong to "
-            "hinges and sliders between links with mass."
-        )
-    values = [_Control(control, i, len(motors)) for i in range(len(motors))]
-    found: list[Any] = [Motor(*pair) for pair in zip(motors, values, strict=True)]  # pyright: ignore[reportCallIssue]
-    return found
-
-
-class _Control(eqx.Module):
-    """One of the values of `control`."""
-
-    control: Callable
-    index: int = eqx.field(static=True)
-    number: int = eqx.field(static=True)
-
-    def __call__(self, t: RealScalarLike, args: Args) -> Float[Array, ""]:
-        values = floating(self.control(t, args))
-        if values.shape != (self.number,):
-            raise ValueError(
-                f"`control` must return the values of all motors, shape ({self.number},), got {values.shape}."
-            )
-        return values[self.index]

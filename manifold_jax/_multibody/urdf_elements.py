@@ -39,6 +39,14 @@ class Link(NamedTuple):
     inertia: np.ndarray
 
 
+class Mimic(NamedTuple):
+    """What a joint does as another one: `x = multiplier z + offset` (rad or m), `other` is the joint of `z`."""
+
+    other: str
+    multiplier: float
+    offset: float
+
+
 class Joint(NamedTuple):
     """A joint between two links, by their names, and its type in the file."""
 
@@ -51,7 +59,7 @@ class Joint(NamedTuple):
     damping: float
     friction: float
     limits: tuple[float, float] | None
-    mimics: bool
+    mimic: "Mimic | None"
     rest: Placement = Placement(np.eye(3), np.zeros(3))  # after its motion
 
 
@@ -124,7 +132,17 @@ def _joint(element: ElementTree.Element, links: dict[str, Link]) -> Joint:
         _number(dynamics, "damping", 0.0, what),
         _number(dynamics, "friction", 0.0, what),
         None if limits is None else (limits[0], limits[1]),
-        element.find("mimic") is not None,
+        _mimic(element.find("mimic"), what),
+    )
+
+
+def _mimic(element: ElementTree.Element | None, what: str) -> Mimic | None:
+    if element is None:
+        return None
+    what = f"<mimic> of {what}"
+    multiplier = _number(element, "multiplier", 1.0, what)
+    return Mimic(
+        _attribute(element, "joint", what), multiplier, _number(element, "offset", 0.0, what)
     )
 
 
