@@ -1,7 +1,7 @@
 """From links to bodies: what is welded together becomes one body, and links without mass between hinges
-become joints with several axes."""
+become joints with several axes, if there are such joints."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -75,6 +75,9 @@ class Groups:
     def body(self, group: str) -> Body:
         """Return the body of all links of a group: its frame has the directions of the root's."""
         parts = [link for link in self.members[group] if link.mass != 0]
+        if not parts:
+            origin = self.placed[self.members[group][0].name].origin
+            return Body(self.body_name(group), 0.0, np.zeros((3, 3)), position=origin)
         mass, centers = self.mass(group), [self._center(link) for link in parts]
         center = sum(link.mass * at.origin for link, at in zip(parts, centers, strict=True)) / mass
         inertia = np.zeros((3, 3))
@@ -90,9 +93,14 @@ class Groups:
 
 
 def connections(
-    tree: KinematicTree, groups: Groups, axes: Sequence[tuple[bool, np.ndarray, np.ndarray]]
+    tree: KinematicTree,
+    groups: Groups,
+    axes: Sequence[tuple[bool, np.ndarray, np.ndarray]],
+    ends: Collection[str],
+    used: Collection[str],
 ) -> list[Connection]:
-    """Return the joints between groups; those through links without mass become one."""
+    """Return the joints between groups. Those through links without mass become one where there is such a joint;
+    links at the `ends` of loops are kept, and so are the joints that are `used` by name."""
     found = []
     for joint in tree.order:
         own = [Axis(*axes[i]) for i in tree.columns[joint.name]]
@@ -104,68 +112,81 @@ def connections(
             )
         if own:
             found.append(Connection(joint.name, first, second, own))
-    for group in groups.members:
-        if groups.mass(group) == 0 and group != groups.of(tree.root):
-            found = _without(found, group, groups)
+    kept = {groups.of(tree.root), *ends}
+    massless = [name for name in groups.members if groups.mass(name) == 0 and name not in kept]
+    found = _without_loose_ends(found, massless)
+    for group in massless:
+        found = _merged(found, group, used)
     return found
 
 
-def _without(found: list[Connection], group: str, groups: Groups) -> list[Connection]:
-    """Remove a group without mass: what hangs on one joint, or is between two."""
+def _without_loose_ends(found: list[Connection], massless: Collection[str]) -> list[Connection]:
+    """Remove links without mass that hang on one joint."""
+    while True:
+        ends = [end for connection in found for end in (connection.first, connection.second)]
+        loose = {group for group in massless if ends.count(group) == 1}
+        if not loose:
+            return found
+        found = [c for c in found if not {c.first, c.second} & loose]
+
+
+def _merged(found: list[Connection], group: str, used: Collection[str]) -> list[Connection]:
+    """Replace a group without mass and its two joints by one joint, if there is one that has all their axes."""
     own = [c for c in found if group in (c.first, c.second)]
-    rest = [c for c in found if group not in (c.first, c.second)]
-    if len(own) < 2:
-        return rest
-    if len(own) > 2:
-        names = ", ".join(repr(c.name) for c in own)
-        raise ValueError(
-            f"The link {groups.body_name(group)!r} has no mass, but joins {names}. Give it mass and inertia in `file`."
-        )
+    if len(own) != 2 or any(c.name in used for c in own):
+        return found
     one, other = own
     one = one if one.second == group else one.reversed()
     other = other if other.first == group else other.reversed()
-    name = f"{one.name} {other.name}"
+    merged = Connection(f"{one.name} {other.name}", one.first, other.second, one.axes + other.axes)
+    if _joint_with(merged.axes) is None:
+        return found
     place = found.index(own[0])
-    merged = Connection(name, one.first, other.second, one.axes + other.axes)
-    return (
-        [c for c in found[:place] if c in rest] + [merged] + [c for c in found[place:] if c in rest]
-    )
+    rest = lambda part: [c for c in part if c not in own]
+    return [*rest(found[:place]), merged, *rest(found[place:])]
+
+
+def _joint_with(axes: list[Axis]) -> type[AbstractJoint] | None:
+    """Return the kind of joint that has such axes, one after the other."""
+    directions = np.stack([axis.direction for axis in axes])
+    turning = sum(axis.turns for axis in axes)
+    one_point = all(np.linalg.norm(axis.at - axes[0].at) < _ROUNDING for axis in axes)
+    if len(axes) == 1:
+        return Revolute if turning else Prismatic
+    if turning == len(axes) == 2 and one_point and abs(directions[0] @ directions[1]) < _ROUNDING:
+        return Universal
+    if turning == len(axes) == 3 and one_point and abs(np.linalg.det(directions)) > 1e-3:
+        return Spherical
+    parallel = len(axes) == 2 and np.linalg.norm(np.cross(*directions)) < _ROUNDING
+    return Cylindrical if parallel and turning == 1 else None
 
 
 def joint_between(connection: Connection, names: Mapping[str, str]) -> AbstractJoint:
     """Return the joint that has the axes of a connection."""
-    first, second, name = names[connection.first], names[connection.second], connection.name
-    axes = connection.axes
-    a, *others = axes
-    turning = [axis for axis in axes if axis.turns]
-    given: dict[str, Any] = dict(name=name, at=turning[0].at if turning else a.at)
-    if len(axes) == 1:
-        kind = Revolute if a.turns else Prismatic
-        return kind(first, second, axis=a.direction, **given)
-    one_point = all(np.linalg.norm(axis.at - a.at) < _ROUNDING for axis in others)
-    directions = np.stack([axis.direction for axis in axes])
-    if (
-        len(turning) == len(axes) == 2
-        and one_point
-        and abs(directions[0] @ directions[1]) < _ROUNDING
-    ):
+    axes, kind = connection.axes, _joint_with(connection.axes)
+    at = next((axis.at for axis in axes if axis.turns), axes[0].at)
+    ends = names[connection.first], names[connection.second]
+    given: dict[str, Any] = dict(name=connection.name, at=at)
+    direction = axes[0].direction
+    if kind is Spherical:
+        return Spherical(*ends, **given)
+    if kind is Universal:
         # perpendicular to the last digit, as the joint wants them
-        aligned = directions[1] - directions[0] * (directions[0] @ directions[1])
-        return Universal(first, second, axis=(directions[0], aligned), **given)
-    if len(turning) == len(axes) == 3 and one_point and abs(np.linalg.det(directions)) > 1e-3:
-        return Spherical(first, second, **given)
-    if len(axes) == 2 and len(turning) == 1 and np.linalg.norm(np.cross(*directions)) < _ROUNDING:
-        return Cylindrical(first, second, axis=a.direction, **given)
-    kinds = ", ".join("hinge" if axis.turns else "slider" for axis in axes)
+        aligned = axes[1].direction - direction * (direction @ axes[1].direction)
+        return Universal(*ends, axis=(direction, aligned), **given)
+    if kind in (Revolute, Prismatic, Cylindrical):
+        return kind(*ends, axis=direction, **given)
     raise ValueError(
-        f"The joints {name!r} ({kinds}) have only links without mass between them, and together are none of the joints "
-        "supported: two perpendicular hinges through one point, three that do not lie in a plane, or a hinge and a "
-        "slider on one axis. Give the links between them mass and inertia in `file`."
+        f"The joint {connection.name!r} has axes that are none of a joint that is supported: a universal joint has two "
+        "perpendicular ones, a ball joint three."
     )
 
 
-def body_names(groups: Groups, root: str, moves: bool) -> dict[str, str]:
-    """Return the name of the body of every group that has one; that of the root may be the ground."""
+def body_names(
+    groups: Groups, root: str, moves: bool, connected: Collection[str]
+) -> dict[str, str]:
+    """Return the name of the body of every group that has one: those with mass, and those that are connected. That
+    of the root may be the ground."""
     root = groups.of(root)
     if moves and groups.mass(root) == 0:
         raise ValueError(
@@ -174,6 +195,6 @@ def body_names(groups: Groups, root: str, moves: bool) -> dict[str, str]:
     names = {
         group: groups.body_name(group)
         for group in groups.members
-        if groups.mass(group) != 0 and group != root
+        if (groups.mass(group) != 0 or group in connected) and group != root
     }
     return {root: groups.body_name(root) if moves else GROUND, **names}

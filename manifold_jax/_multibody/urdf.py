@@ -131,8 +131,13 @@ def read_urdf(
     x = _closed(tree, additions.closures, configuration or {})
     placed, axes = tree.place(x)
     groups = Groups(tree, additions.closures, placed)
-    names = body_names(groups, tree.root, floating_base)
-    own = [joint_between(c, names) for c in connections(tree, groups, axes)]
+    loops = [loop for loop in additions.closures if not loop.is_rigid]
+    ends = {groups.of(link) for loop in loops for link in (loop.first, loop.second)}
+    used = {joint.name for joint in elements if joint.damping != 0} | mimics | {*additions.motors}
+    found = connections(tree, groups, axes, ends, used)
+    connected = ends | {group for c in found for group in (c.first, c.second)}
+    names = body_names(groups, tree.root, floating_base, connected)
+    own = [joint_between(connection, names) for connection in found]
     own += _ball_joints(additions.closures, groups, names, placed)
     acting = dampers_of(elements, own) + motors_of(additions.motors, own, control)
     bodies = [groups.body(group) for group in names if names[group] != GROUND]
@@ -228,13 +233,7 @@ def _ball_joints(
     for closure in closures:
         if closure.is_rigid:
             continue
-        ends = [groups.of(link) for link in (closure.first, closure.second)]
-        if missing := [groups.body_name(end) for end in ends if end not in names]:
-            raise ValueError(
-                f"The loop {closure.name} ends at the link {missing[0]!r}, which has no mass. Give it mass and inertia in "
-                "`file`, or close the loop by type '6d'."
-            )
-        bodies = [names[end] for end in ends]
+        bodies = [names[groups.of(link)] for link in (closure.first, closure.second)]
         if bodies[0] == bodies[1]:
             raise ValueError(f"The loop {closure.name} connects {bodies[0]!r} with itself.")
         found.append(Spherical(*bodies, at=placed[closure.first].origin, name=closure.name))
