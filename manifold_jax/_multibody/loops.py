@@ -4,10 +4,11 @@ Source: Levenberg-Marquardt steps, Nocedal & Wright, Numerical Optimization (200
 assembly analysis of Haug, Computer Aided Kinematics and Dynamics of Mechanical Systems (1989), ch. 4.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
+from scipy.sparse.csgraph import connected_components
 
 from .kinematic_tree import KinematicTree
 from .urdf_elements import Placement
@@ -29,25 +30,54 @@ class Closure(NamedTuple):
     is_rigid: bool
 
 
+class _Part(NamedTuple):
+    """Loops that share coordinates, and the equations `A x = b` of joints among them that mimic others."""
+
+    closures: list[Closure]
+    matrix: np.ndarray
+    offset: np.ndarray
+    free: np.ndarray  # the coordinates that may change
+
+
 def close_loops(
     tree: KinematicTree, closures: Sequence[Closure], x: np.ndarray, held: Sequence[int]
 ) -> np.ndarray:
     """Return coordinates for which all loops are closed and that mimic others as they should, found from `x` or,
     where that fails, from starts beside it; those `held` stay."""
     free = np.setdiff1d(np.arange(tree.size), held)
-    random, rest = np.random.default_rng(0), tree.rest
-    found, trial = [], x
+    for part in _parts(tree, closures, free):
+        x = _closed_from_starts(tree, part, x)
+    _check_closed(tree, closures, x)
+    return np.where(_is_free_angle(tree, free), (x + np.pi) % (2 * np.pi) - np.pi, x)
+
+
+def _parts(tree: KinematicTree, closures: Sequence[Closure], free: np.ndarray) -> Iterator[_Part]:
+    """Yield the loops that share free coordinates together: legs of a robot one after the other."""
+    (matrix, offset), is_free = tree.mimics(), np.isin(np.arange(tree.size), free)
+    uses = np.zeros((len(closures), tree.size), bool)
+    for i, closure in enumerate(closures):
+        uses[i, tree.ancestors(closure.first) + tree.ancestors(closure.second)] = True
+    uses = np.concatenate([uses, matrix != 0]) & is_free
+    number, part_of = connected_components(uses.astype(int) @ uses.T.astype(int), directed=False)
+    of_loops, of_mimics = np.split(part_of, [len(closures)])
+    for k in range(number):
+        own = [closure for closure, part in zip(closures, of_loops, strict=True) if part == k]
+        rows = of_mimics == k
+        yield _Part(own, matrix[rows], offset[rows], np.flatnonzero(uses[part_of == k].any(axis=0)))
+
+
+def _closed_from_starts(tree: KinematicTree, part: _Part, x: np.ndarray) -> np.ndarray:
+    random, rest, found, trial = np.random.default_rng(0), tree.rest, [], x
     for _ in range(_STARTS):
         tree.rest = dict(rest)
-        trial, gap = _descend(tree, closures, trial.copy(), free)
+        trial, gap = _descend(tree, part, trial.copy())
         found.append((np.abs(gap).max(initial=0), trial, tree.rest))
         if found[-1][0] <= _CLOSED:
             break
         trial = x.copy()
-        trial[free] += random.normal(scale=_SPREAD, size=free.size)
+        trial[part.free] += random.normal(scale=_SPREAD, size=part.free.size)
     _, x, tree.rest = min(found, key=lambda one: one[0])
-    _check_closed(tree, closures, x)
-    return np.where(_is_free_angle(tree, free), (x + np.pi) % (2 * np.pi) - np.pi, x)
+    return x
 
 
 def _is_free_angle(tree: KinematicTree, free: np.ndarray) -> np.ndarray:
@@ -55,34 +85,29 @@ def _is_free_angle(tree: KinematicTree, free: np.ndarray) -> np.ndarray:
     return np.array(turns, bool) & np.isin(np.arange(tree.size), free)
 
 
-def _descend(
-    tree: KinematicTree, closures: Sequence[Closure], x: np.ndarray, free: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def _descend(tree: KinematicTree, part: _Part, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return coordinates where the gaps are least, and the gaps."""
-    damping, (gap, J) = 1e-2, _gaps(tree, closures, x)
+    free, damping, (gap, J) = part.free, 1e-2, _gaps(tree, part, x)
     for _ in range(_STEPS):
         if np.abs(gap).max(initial=0) < _ROUNDING or damping > _MOST_DAMPING:
             break
         trial, own = x.copy(), J[:, free]
         trial[free] -= np.linalg.solve(own.T @ own + damping * np.eye(free.size), own.T @ gap)
-        new_gap, _ = _gaps(tree, closures, trial)
+        new_gap, _ = _gaps(tree, part, trial)
         if new_gap @ new_gap < gap @ gap:
             x, damping = trial, max(damping / 5, _LEAST_DAMPING)
             tree.turn_ball_joints(x)
-            gap, J = _gaps(tree, closures, x)
+            gap, J = _gaps(tree, part, x)
         else:
             damping *= 4
     return x, gap
 
 
-def _gaps(
-    tree: KinematicTree, closures: Sequence[Closure], x: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def _gaps(tree: KinematicTree, part: _Part, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return all gaps and their derivatives by the coordinates."""
     placed, axes = tree.place(x)
-    matrix, offset = tree.mimics()
-    gaps, rows = [matrix @ x - offset], [matrix]
-    for closure in closures:
+    gaps, rows = [part.matrix @ x - part.offset], [part.matrix]
+    for closure in part.closures:
         gap = closure_gap(placed, closure)
         J = np.zeros((12, tree.size))
         for link, sign in ((closure.first, -1), (closure.second, 1)):
