@@ -260,8 +260,9 @@ def digits(problem, name, tolerance=1.0, **options):
 @pytest.mark.parametrize(
     ("problem", "name", "least", "most_steps"),
     [
-        ("Robertson", "Rodas5P", 7.0, 720),
-        ("Robertson, DAE", "Rodas5P", 7.0, 720),
+        # 7.2 as users compile it. Rounding, with other flags of the compiler and the newest JAX, leaves 6.8.
+        ("Robertson", "Rodas5P", 6.5, 720),
+        ("Robertson, DAE", "Rodas5P", 6.5, 720),
         ("chemical Akzo Nobel", "Rodas5P", 8.0, 180),
         ("chemical Akzo Nobel", "Rodas3P", 7.5, 930),
     ],
