@@ -2,6 +2,11 @@
 
 from .assembly import Assembly as Assembly
 from .bodies import Body as Body, GROUND as GROUND, Pose as Pose
+from .contacts import (
+    GroundContact as GroundContact,
+    JointFriction as JointFriction,
+    JointStop as JointStop,
+)
 from .forces import (
     AbstractForce as AbstractForce,
     Controller as Controller,

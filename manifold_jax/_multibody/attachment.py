@@ -139,9 +139,9 @@ def name_all(given: Any, base: type, what: str) -> list[tuple[Any, str]]:
     return list(zip(things, unique_names(what, names), strict=True))
 
 
-def grouped(things: Iterable[tuple], kind: Callable) -> dict[type, zip]:
+def grouped(things: Iterable[tuple], kind: Callable) -> dict[Any, zip]:
     """Group things by `kind(*thing)`, in order of first occurrence; transpose each group."""
-    groups: dict[type, list[tuple]] = {}
+    groups: dict[Any, list[tuple]] = {}
     for thing in things:
         groups.setdefault(kind(*thing), []).append(thing)
     return {kind: zip(*own, strict=True) for kind, own in groups.items()}

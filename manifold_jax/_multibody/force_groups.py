@@ -5,11 +5,11 @@ from typing import Any
 import numpy as np
 
 from .._base.user_functions import check_function
-from . import forces, joints
+from . import contacts, forces, joints
 from .attachment import attach, grouped, name_all
 from .bodies import Bodies
 from .checks import check_shape, is_concrete, stack, Values
-from .equations import DRIVEN
+from .contact_loads import contact_loads, friction_laws, stop_laws
 from .frames import in_space
 from .joint_groups import attachment_of, find_joint, Found, JointGroup
 from .loads import (
@@ -61,25 +61,40 @@ def _controlled(
     return ControlledLoads(hinges, attachment_of(found, controller.joints), controller.law)
 
 
-def _kind(force: Any, name: str, found: Found | None) -> type:
-    """Return the kind of the joint that a force acts in, otherwise its own kind."""
-    if found is not None:
-        return found[0].kind
-    kinds = forces.AbstractLineForce, forces.Torque, forces.RotationalDamper
-    return next((kind for kind in kinds if isinstance(force, kind)), forces.Force)
+def _kind(force: Any, name: str, found: Found | None) -> tuple[type, type | None]:
+    """Return the kind of a force, and that of the joint that it acts in."""
+    kinds = (
+        forces.AbstractLineForce,
+        forces.Torque,
+        forces.RotationalDamper,
+        contacts.JointStop,
+        contacts.JointFriction,
+        contacts.GroundContact,
+        forces.AbstractJointForce,
+    )
+    kind = next((kind for kind in kinds if isinstance(force, kind)), forces.Force)
+    return kind, None if found is None else found[0].kind
 
 
 def _loads(
-    kind: type, bodies: Bodies, things: tuple, names: tuple[str, ...], found: tuple
+    kinds: tuple[type, type | None], bodies: Bodies, things: tuple, names: tuple, found: tuple
 ) -> AbstractLoads:
+    kind, joint = kinds
+    if joint is not None:
+        laws = {contacts.JointStop: stop_laws, contacts.JointFriction: friction_laws}
+        own = laws.get(kind, _joint_laws)(things, names)
+        return JointLoads(joint is joints.Revolute, attachment_of(found, names), own)
     if kind is forces.AbstractLineForce:
         return LineLoads(attach(bodies, things, names), _laws(things, names, "length"))
-    if kind in DRIVEN:
-        laws = _laws(things, names, "rest")
-        return JointLoads(kind is joints.Revolute, attachment_of(found, names), laws)
     if kind is forces.RotationalDamper:
         return _rotational(bodies, things, names)
+    if kind is contacts.GroundContact:
+        return contact_loads(bodies, things, names)
     return _on_bodies(kind is forces.Torque, bodies, things, names)
+
+
+def _joint_laws(things: tuple, names: tuple[str, ...]) -> SpringLaws:
+    return _laws(things, names, "rest")
 
 
 def _rotational(bodies: Bodies, dampers: tuple, names: tuple[str, ...]) -> RotationalLoads:

@@ -25,8 +25,8 @@ class AbstractLineForce(AbstractForce):
 
 
 class AbstractJointForce(AbstractForce):
-    """A force in a hinge or slider: `stiffness (x - rest) + damping x' - value` acts against its
-    coordinate `x`. Missing terms are zero."""
+    """A force in a hinge or slider. Those without a law of their own are terms of
+    `stiffness (x - rest) + damping x' - value`, which acts against its coordinate `x`."""
 
     joint: str = eqx.field(static=True)
 

@@ -94,7 +94,7 @@ class JointLoads(AbstractLoads):
 
     hinge: bool = eqx.field(static=True)
     attachment: Attachment
-    laws: SpringLaws
+    laws: Any  # `SpringLaws`, or others with the same methods
 
     def wrench(self, t: RealScalarLike, y: State, frames: Frames, args: Args) -> Wrench:
         sides = self.attachment.sides(frames)

@@ -14,6 +14,7 @@ from .._base.user_functions import check_function
 from .assembly import Assembly
 from .checks import floating
 from .forces import AbstractForce, JointSpring, Motor, RotationalDamper, RotorInertia
+from .joints import AbstractRestraint
 from .mujoco_checks import actuator_fault, disabled, import_mujoco, refuse_unsupported
 from .mujoco_state import drawing_of
 from .mujoco_tree import Tree
@@ -23,6 +24,8 @@ def from_mujoco(
     model: Any,
     *,
     control: Callable | None = None,
+    joints: Sequence[AbstractRestraint] = (),
+    forces: Sequence[AbstractForce] = (),
     ignore: Sequence[str] = (),
     redundant: bool = False,
 ) -> Assembly:
@@ -36,6 +39,8 @@ def from_mujoco(
     - `model`: a `mujoco.MjModel`, a string of XML, or the path of a file.
     - `control`: `f(t, args)` returns the controls `(nu,)` of its actuators; `None` for zeros, as in
         MuJoCo.
+    - `joints`, `forces`: further ones for the [`Assembly`][], such as [`JointStop`][] for limits and
+        [`GroundContact`][].
     - `ignore`: what to leave out instead of refusing it, by the words of the error message, such as
         `("contact", "joint limit")`.
     - `redundant`: as for [`Assembly`][].
@@ -62,15 +67,15 @@ def from_mujoco(
         check_function("control", control, "f(t, args)")
     tree = Tree(mujoco, model, drawing_of(mujoco, model))
     gravity = np.zeros(3) if disabled(mujoco, model, "GRAVITY") else model.opt.gravity
-    bodies, joints = tree.bodies(), tree.joints()
+    bodies, own = tree.bodies(), tree.joints()
     if not bodies:
         raise ValueError(
             "`model` has no body that moves: joints and free bodies belong in its `worldbody`."
         )
     return Assembly(
         bodies,
-        joints + tree.equalities(),
-        _passive_forces(tree) + _actuators(tree, control),
+        [*own, *tree.equalities(), *joints],
+        [*_passive_forces(tree), *_actuators(tree, control), *forces],
         gravity=gravity,
         redundant=redundant,
     )

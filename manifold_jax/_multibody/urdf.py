@@ -44,8 +44,8 @@ class Robot(eqx.Module):
     - `assembly`: the [`Assembly`][manifold_jax.multibody.Assembly], drawn with all loops closed.
     - `configuration`: the coordinates (rad or m) of hinges and sliders in the drawing, by the names
         of the file. `assembly.joint_coordinates` counts from there.
-    - `limits`: lower and upper limits of these in the file. They are not enforced: a stop is an
-        [`impact`][manifold_jax.impact].
+    - `limits`: lower and upper limits of these in the file. They are not enforced: a
+        [`JointStop`][manifold_jax.multibody.JointStop] yields, an [`impact`][manifold_jax.impact] does not.
     - `motors`: the names of joints with motors, in the order of the values of `control`.
     - `frames`: for every link of the file its body, and origin `at` and rotation of its frame in the
         drawing. `markers={"foot": robot.frames["foot"][:2]}` draws the path of its origin.
@@ -173,7 +173,7 @@ def _supported(joints: Sequence[Joint], ignore: Sequence[str]) -> list[Joint]:
     if rubbing and "friction" not in ignore:
         raise ValueError(
             f"`file` has joints with <friction>, which is not supported: {', '.join(rubbing[:10])}. Leave it out by "
-            "`ignore=('friction',)`, or change the file."
+            "`ignore=('friction',)`, and add a `JointFriction` by `forces`."
         )
     if "mimic" in ignore:
         return [joint._replace(mimic=None) for joint in joints]
