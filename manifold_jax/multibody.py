@@ -33,6 +33,7 @@ from ._multibody import (
     Spherical as Spherical,
     Spring as Spring,
     state_of_mujoco as state_of_mujoco,
+    Tendon as Tendon,
     Torque as Torque,
     Universal as Universal,
 )

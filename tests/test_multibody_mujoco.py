@@ -112,10 +112,27 @@ class RandomTree:
             for kind, i in self.numbered_joints()
             if kind in ("hinge", "slide")
         )
+        tendons, motors = self.with_tendons(motors) if self.armature else ("", motors)
         return (
             f'<mujoco><option gravity="{self.numbers(5)}"/><worldbody>{bodies}</worldbody>'
-            f"<actuator>{motors}</actuator></mujoco>"
+            f"{tendons}<actuator>{motors}</actuator></mujoco>"
         )
+
+    def with_tendons(self, motors):
+        """Two tendons, one with a spring, and motors with limits of their forces on these and on a joint."""
+        names = [f"j{i}" for kind, i in self.numbered_joints() if kind in ("hinge", "slide")]
+        parts = lambda own: "".join(
+            f'<joint joint="{n}" coef="{self.numbers(1, 1)}"/>' for n in own
+        )
+        tendons = (
+            f'<fixed name="rope" springlength="0.4" stiffness="3" damping="0.7">{parts(names[::2])}</fixed>'
+            f'<fixed name="belt">{parts(names[1:4])}</fixed>'
+        )
+        limit = 'forcelimited="true" forcerange="-0.3 0.4"'
+        motors += f'<position tendon="rope" kp="7" kv="0.3" gear="1.7" {limit}/>'
+        motors += f'<position tendon="belt" kp="2" gear="-0.6"/><motor joint="{names[0]}" {limit}/>'
+        motors += f'<position joint="{names[1]}" kp="0.2" forcelimited="true" forcerange="-90 90"/>'
+        return f"<tendon>{tendons}</tendon>", motors
 
 
 def several(i):
@@ -154,6 +171,9 @@ def test_accelerations_of_random_trees(seed, armature):
     assert max(np.abs(gap).max() for gap in gaps) < 1e-14
     solved = accelerations_by_joints if armature else accelerations
     actual = solved(robot, y, jnp.asarray(data.ctrl))
+    if armature:
+        at_limits = np.isin(data.actuator_force, [-0.3, 0.4])
+        assert at_limits.any() and not at_limits[-1]  # noqa: PT018
     for ours, theirs in zip(actual, those_of_mujoco(robot, model, data)):
         assert np.abs(theirs).max() > 1
         np.testing.assert_allclose(ours, theirs, rtol=0, atol=1e-11)
@@ -297,12 +317,12 @@ COUPLED_TENDON = """<tendon><fixed name="rope"><joint joint="j" coef="1"/></fixe
         (('<joint name="j" type="ball" stiffness="1"/>', QUIET, "", ""), "stiffness of several .*: j"),
         ((FREE, "", '<geom name="floor" type="plane" size="1 1 1"/>', ""), "contact: .*ball"),
         (
-            (FREE, QUIET, "", '<tendon><fixed name="rope"><joint joint="j" coef="1"/></fixed></tendon>'),
+            (FREE, QUIET, "", '<tendon><fixed name="rope" limited="true" range="0 1"><joint joint="j" coef="1"/></fixed></tendon>'),
             "tendon: rope",
         ),
         (
             (FREE, QUIET, "", COUPLED_TENDON),
-            "tendon: rope; equality of type tendon: belt",
+            "equality of type tendon: belt",
         ),
         (
             (FREE, QUIET, "", '<actuator><general name="lag" joint="j" dyntype="filter"/></actuator>'),

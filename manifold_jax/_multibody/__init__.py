@@ -18,6 +18,7 @@ from .forces import (
     RotationalDamper as RotationalDamper,
     RotorInertia as RotorInertia,
     Spring as Spring,
+    Tendon as Tendon,
     Torque as Torque,
 )
 from .joint_coordinates import JointCoordinates as JointCoordinates

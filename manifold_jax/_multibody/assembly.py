@@ -50,8 +50,8 @@ class Assembly(eqx.Module):
         [`Prismatic`][], [`Cylindrical`][], [`Universal`][], [`Fixed`][], [`Distance`][]; [`Drive`][]
         where their motion is prescribed, and [`Coupling`][] of two of them.
     - `forces`: [`Spring`][], [`Damper`][], [`RotationalDamper`][], [`JointSpring`][], [`Motor`][],
-        [`LinearActuator`][], [`Controller`][], [`Force`][], [`Torque`][], [`JointStop`][], [`JointFriction`][],
-        [`GroundContact`][], and [`RotorInertia`][].
+        [`LinearActuator`][], [`Tendon`][], [`Controller`][], [`Force`][], [`Torque`][], [`JointStop`][],
+        [`JointFriction`][], [`GroundContact`][], and [`RotorInertia`][].
     - `gravity` (m/s^2): shape `(2,)` or `(3,)`; `None` for none.
     - `redundant`: whether equations of joints depend on each other, as in most closed loops in
         space that move in a plane. `Assembly.state` says so.

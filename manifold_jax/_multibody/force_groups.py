@@ -21,6 +21,7 @@ from .loads import (
     RotationalLoads,
     SpringLaws,
 )
+from .tendon_loads import tendon_loads
 
 
 _ADVICE = "Springs and motors belong to `Revolute` and `Prismatic` joints; between points use `Spring` and `LinearActuator`."
@@ -38,15 +39,26 @@ def group_forces(
     named = [
         (force, name, find_joint(groups, force.joint, name, _ADVICE) if in_joint(force) else None)
         for force, name in everything
-        if not isinstance(force, forces.Controller)
+        if not isinstance(force, forces.Controller | forces.Tendon)
     ]
+    tendons = [(force, name) for force, name in everything if isinstance(force, forces.Tendon)]
     controlled = [
         _controlled(groups, force, name)
         for force, name in everything
         if isinstance(force, forces.Controller)
     ]
     kinds = grouped(named, _kind).items()
-    return (*(_loads(kind, bodies, *own) for kind, own in kinds), *controlled)
+    alone = [_loads(kind, bodies, *own) for kind, own in kinds]
+    return (*alone, *_through_joints(groups, tendons), *controlled)
+
+
+def _through_joints(
+    groups: tuple[JointGroup, ...], named: list[tuple[Any, str]]
+) -> tuple[AbstractLoads, ...]:
+    if not named:
+        return ()
+    tendons, names = zip(*named, strict=True)
+    return (tendon_loads(groups, tendons, names, _laws(tendons, names, "rest")),)
 
 
 def _controlled(

@@ -169,6 +169,40 @@ class Controller(AbstractForce):
     name: str | None = eqx.field(static=True, default=None)
 
 
+class Tendon(AbstractForce):
+    """A tendon over pulleys of constant radii, through several hinges and sliders (a fixed tendon of MuJoCo): it has
+    the length `l = sum_i r_i x_i` of their coordinates `x_i`, and acts in each with `r_i F` in the direction of its
+    coordinate,
+
+        F = value - stiffness (l - rest) - damping l',   within `limits`.
+
+    With one joint it is a servo motor of limited torque: `Tendon(("elbow",), (1.0,), lambda t, args: 50 * args,
+    stiffness=50.0, damping=2.0, limits=(-10.0, 10.0))` turns the elbow to the angle `args`.
+
+    **Arguments:**
+
+    - `joints`: the names of [`Revolute`][] and [`Prismatic`][] joints, `k` of them; their coordinates as for
+        [`JointSpring`][].
+    - `coefficients`: the radii `r_i` (m, of sliders no unit), shape `(k,)`, with signs.
+    - `value` (N), a number or `f(t, args)`; `stiffness` (N/m), `rest` (m), `damping` (N s/m).
+    - `limits` of `F` (N): a pair, or `None`.
+    - `name`: by default made from the names of the joints.
+
+    The energy of its spring is part of `Assembly.energy` where it has no limits.
+
+    Source: MuJoCo's XML reference, `tendon/fixed` and `actuator/general`.
+    """
+
+    joints: tuple[str, ...] = eqx.field(static=True, converter=tuple)
+    coefficients: Any
+    value: Any = 0.0
+    stiffness: Any = 0.0
+    rest: Any = 0.0
+    damping: Any = 0.0
+    limits: Any = None
+    name: str | None = eqx.field(static=True, default=None)
+
+
 class Force(AbstractForce):
     """A force on a body, in world coordinates.
 

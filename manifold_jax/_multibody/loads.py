@@ -148,13 +148,7 @@ class ControlledLoads(AbstractLoads):
                 f"`law` of a `Controller` must return one value for each of its joints, shape ({len(self.hinges)},), got "
                 f"{values.shape}."
             )
-        sides = self.attachment.sides(frames)
-        push = values[:, None] * sides.frame_first[:, :, 2]
-        turns = np.array(self.hinges)[:, None]
-        force, torque = jnp.where(turns, 0, push), jnp.where(turns, push, 0)
-        first, second = self.attachment.index
-        on_second = apply(frames, second, sides.second, force, torque)
-        return add(on_second, apply(frames, first, sides.second, -force, -torque))
+        return apply_in_joints(frames, self.attachment, self.hinges, values)
 
     def potential(self, frames: Frames) -> FloatScalar:
         return jnp.zeros((), frames.origin.dtype)
@@ -175,6 +169,19 @@ class RotationalLoads(AbstractLoads):
 
     def potential(self, frames: Frames) -> FloatScalar:
         return jnp.zeros((), frames.origin.dtype)
+
+
+def apply_in_joints(
+    frames: Frames, attachment: Attachment, hinges: tuple[bool, ...], values: Float[Array, " k"]
+) -> Wrench:
+    """Apply torques in hinges, and forces in sliders, in the directions of their coordinates."""
+    sides = attachment.sides(frames)
+    push = values[:, None] * sides.frame_first[:, :, 2]
+    turns = np.array(hinges)[:, None]
+    force, torque = jnp.where(turns, 0, push), jnp.where(turns, push, 0)
+    first, second = attachment.index
+    on_second = apply(frames, second, sides.second, force, torque)
+    return add(on_second, apply(frames, first, sides.second, -force, -torque))
 
 
 def apply(frames: Frames, index: np.ndarray, at: Vectors, force: Any, torque: Any) -> Wrench:

@@ -4,18 +4,14 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
 
-from .._base.types import Args, RealScalarLike
 from .._base.user_functions import check_function
 from .assembly import Assembly
-from .checks import floating
-from .forces import AbstractForce, JointSpring, Motor, RotationalDamper, RotorInertia
+from .forces import AbstractForce, JointSpring, RotationalDamper, RotorInertia
 from .joints import AbstractRestraint
-from .mujoco_checks import actuator_fault, disabled, import_mujoco, refuse_unsupported
+from .mujoco_actuators import actuators, tendon_springs
+from .mujoco_checks import disabled, import_mujoco, refuse_unsupported
 from .mujoco_state import drawing_of
 from .mujoco_tree import Tree
 
@@ -47,8 +43,8 @@ def from_mujoco(
 
     Read are bodies with their inertias and any number of hinge, slide and ball joints each, or a free one;
     stiffness, damping and armature of hinges and slides, damping of ball joints; `equality` of the types connect,
-    weld and joint; gravity; actuators of hinges and slides with constant gain and affine bias (motor, position,
-    velocity, damper). The drawing is the pose `qpos0`, with coupled joints where their couplings have them.
+    weld and joint; gravity; fixed tendons; actuators of hinges, slides and fixed tendons with constant gain and affine
+    bias (motor, position, velocity, damper). The drawing is the pose `qpos0`, with coupled joints where their couplings have them.
     Stiffness of hinges counts angles from `-pi` to `pi`.
 
     A body with several joints hangs on links without mass, `"torso (rootx)"` is the one of the body torso that its
@@ -75,7 +71,7 @@ def from_mujoco(
     return Assembly(
         bodies,
         [*own, *tree.equalities(), *joints],
-        [*_passive_forces(tree), *_actuators(tree, control), *forces],
+        [*_passive_forces(tree), *actuators(tree, control), *tendon_springs(tree), *forces],
         gravity=gravity,
         redundant=redundant,
     )
@@ -109,61 +105,3 @@ def _passive_forces(tree: Tree) -> list[AbstractForce]:
             name = f"damping of {tree.name('joint', j)}"
             found.append(RotationalDamper(parent, body, damping, name))  # pyright: ignore[reportCallIssue]
     return found
-
-
-def _actuators(tree: Tree, control: Callable | None) -> list[AbstractForce]:
-    """Return the motors of actuators: the torque is `gear (gain ctrl + b0 + b1 gear x + b2 gear x')`."""
-    mujoco, model, found = tree.mujoco, tree.model, []
-    if disabled(mujoco, model, "ACTUATION"):
-        return found
-    for i in range(model.nactuator):
-        # those with a fault were refused before, unless the user ignores them
-        if not (actuator_fault(mujoco, model, i) or _group_disabled(model, i)):
-            found += _actuator(tree, control, i)
-    return found
-
-
-def _group_disabled(model: Any, i: int) -> bool:
-    """Whether the group of an actuator is disabled; MuJoCo can disable groups 0 to 30."""
-    group = int(model.actuator_group[i])
-    return 0 <= group <= 30 and bool(int(model.opt.disableactuator) >> group & 1)
-
-
-def _actuator(tree: Tree, control: Callable | None, i: int) -> list[AbstractForce]:
-    model = tree.model
-    joint, name = tree.joint_of[model.actuator_trnid[i, 0]], tree.name("actuator", i)
-    zero = float(tree.drawing.qpos[model.jnt_qposadr[model.actuator_trnid[i, 0]]])
-    gear, gain = float(model.actuator_gear[i, 0]), float(model.actuator_gainprm[i, 0])
-    affine = int(tree.mujoco.mjtBias.mjBIAS_AFFINE)
-    bias = model.actuator_biasprm[i, :3] * (model.actuator_biastype[i] == affine)
-    limits = tuple(map(float, model.actuator_ctrlrange[i]))
-    limits = limits if model.actuator_ctrllimited[i] else (-np.inf, np.inf)
-    constant = gear * float(bias[0])
-    drive = _Drive(control, int(model.actuator_ctrladr[i]), gear * gain, limits, constant)  # pyright: ignore[reportArgumentType]
-    found: list[Any] = [Motor(joint, drive, name=name)]  # pyright: ignore[reportCallIssue]
-    if bias[1] != 0 or bias[2] != 0:
-        stiffness, damping = -(gear**2) * bias[1], -(gear**2) * bias[2]
-        found.append(JointSpring(joint, stiffness, -zero, damping, name=f"{name} bias"))  # pyright: ignore[reportCallIssue]
-    return found
-
-
-class _Drive(eqx.Module):
-    """One control, within its limits, times a factor, plus a constant."""
-
-    control: Callable | None
-    index: int = eqx.field(static=True)
-    factor: float = eqx.field(static=True)
-    limits: tuple[float, float] = eqx.field(static=True)
-    constant: float = eqx.field(static=True)
-
-    def __call__(self, t: RealScalarLike, args: Args) -> Float[Array, ""]:
-        if self.control is None:
-            value = jnp.zeros(())
-        else:
-            value = floating(self.control(t, args))
-            if value.ndim != 1 or value.shape[0] <= self.index:
-                raise ValueError(
-                    f"`control` must return the controls of all actuators, shape (nu,), got {value.shape}."
-                )
-            value = value[self.index]
-        return self.factor * jnp.clip(value, *self.limits) + self.constant

@@ -18,25 +18,25 @@ REFUSED = (
     ("dof_frictionloss", "dof", "friction loss"),
     ("dof_dampingpoly", "dof", "nonlinear damping"),
     ("body_gravcomp", "body", "gravity compensation"),
-    ("actuator_forcelimited", "actuator", "actuator force limit"),
+    ("tendon_actfrclimited", "tendon", "actuator force limit"),
     ("actuator_armature", "actuator", "armature"),
     ("actuator_damping", "actuator", "actuator damping"),
     ("actuator_delay", "actuator", "actuator delay"),
 )
 COUNTED = (
-    ("ntendon", "tendon"),
     ("nflex", "flex"),
     ("nplugin", "plugin"),
     ("nmocap", "mocap body"),
 )
 OTHERS = (
     "contact",
+    "tendon",
     "fluid",
     "disabled springs or dampers",
     "damping of several coordinates",
     "stiffness of several coordinates",
     "armature of several coordinates",
-    "actuator that is not of a joint",
+    "actuator that is not of a joint or fixed tendon",
     "actuator of several coordinates",
     "actuator gain that is not constant",
     "actuator dynamics",
@@ -105,7 +105,7 @@ def _unsupported(mujoco: Any, model: Any) -> Iterator[tuple[str, str]]:
             yield word, name_of(mujoco, model, kind, i)
     for count, word in COUNTED:
         for i in range(getattr(model, count, 0)):
-            yield word, (name_of(mujoco, model, word, i) if word == "tendon" else f"{word} {i}")
+            yield word, f"{word} {i}"
     yield from _forces_of_joints(mujoco, model)
     yield from _elements(mujoco, model)
     yield from _contacts(mujoco, model)
@@ -144,18 +144,44 @@ def _forces_of_joints(mujoco: Any, model: Any) -> Iterator[tuple[str, str]]:
 
 
 def actuator_fault(mujoco: Any, model: Any, i: Index) -> str | None:
-    """Return the reason why an actuator cannot be a motor in a joint, if there is one."""
+    """Return the reason why an actuator cannot be a motor in a joint or pull a tendon, if there is one."""
     on_joint = {int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT)}
-    biases = {int(mujoco.mjtBias.mjBIAS_NONE), int(mujoco.mjtBias.mjBIAS_AFFINE)}
-    if int(model.actuator_trntype[i]) not in on_joint:
-        return "actuator that is not of a joint"
-    if not _with_one_coordinate(mujoco, model, model.actuator_trnid[i, 0]):
+    if is_of_tendon(mujoco, model, i):
+        if tendon_fault(mujoco, model, model.actuator_trnid[i, 0]):
+            return "actuator that is not of a joint or fixed tendon"
+    elif int(model.actuator_trntype[i]) not in on_joint:
+        return "actuator that is not of a joint or fixed tendon"
+    elif not _with_one_coordinate(mujoco, model, model.actuator_trnid[i, 0]):
         return "actuator of several coordinates"
+    biases = {int(mujoco.mjtBias.mjBIAS_NONE), int(mujoco.mjtBias.mjBIAS_AFFINE)}
     if int(model.actuator_gaintype[i]) != int(mujoco.mjtGain.mjGAIN_FIXED):
         return "actuator gain that is not constant"
     if int(model.actuator_dyntype[i]) != int(mujoco.mjtDyn.mjDYN_NONE):
         return "actuator dynamics"
     return None if int(model.actuator_biastype[i]) in biases else "actuator bias that is not affine"
+
+
+def is_of_tendon(mujoco: Any, model: Any, i: Index) -> bool:
+    return int(model.actuator_trntype[i]) == int(mujoco.mjtTrn.mjTRN_TENDON)
+
+
+def tendon_fault(mujoco: Any, model: Any, k: Index) -> str | None:
+    """Return the reason why a tendon is not supported, if there is one: it is fixed, and has a spring and a damper."""
+    own = slice(model.tendon_adr[k], model.tendon_adr[k] + model.tendon_num[k])
+    is_fixed = np.all(model.wrap_type[own] == int(mujoco.mjtWrap.mjWRAP_JOINT))
+    has_slack = model.tendon_stiffness[k] != 0 and np.ptp(model.tendon_lengthspring[k]) != 0
+    others = [
+        np.any(getattr(model, f"tendon_{word}", np.zeros(k + 1))[k] != 0)
+        for word in (
+            "limited",
+            "frictionloss",
+            "armature",
+            "stiffnesspoly",
+            "dampingpoly",
+            "springyield",
+        )
+    ]
+    return "tendon" if not is_fixed or has_slack or any(others) else None
 
 
 def equality_fault(mujoco: Any, model: Any, e: Index) -> str | None:
@@ -171,6 +197,9 @@ def _elements(mujoco: Any, model: Any) -> Iterator[tuple[str, str]]:
     for i in range(model.nactuator):
         if fault := actuator_fault(mujoco, model, i):
             yield fault, name_of(mujoco, model, "actuator", i)
+    for k in range(model.ntendon):
+        if fault := tendon_fault(mujoco, model, k):
+            yield fault, name_of(mujoco, model, "tendon", k)
     for e in range(model.neq):
         fault = equality_fault(mujoco, model, e)
         if fault and model.eq_active0[e]:

@@ -17,7 +17,7 @@ from .joints import (
     Spherical,
     Universal,
 )
-from .mujoco_checks import actuator_fault, disabled, equality_fault, Index, name_of
+from .mujoco_checks import actuator_fault, disabled, equality_fault, Index, is_of_tendon, name_of
 from .mujoco_state import active_couplings, coefficients_of, link_names, quaternion_of
 
 
@@ -114,8 +114,9 @@ class Tree:
         moved = [
             model.actuator_trnid[a, 0]
             for a in range(model.nactuator)
-            if actuator_fault(self.mujoco, model, a) is None
+            if not (actuator_fault(self.mujoco, model, a) or is_of_tendon(self.mujoco, model, a))
         ]
+        moved += list(model.wrap_objid[model.wrap_type == int(self.mujoco.mjtWrap.mjWRAP_JOINT)])
         coupled = [k for _, *pair in active_couplings(self.mujoco, model) for k in pair]
         return any(value != 0 for value in passive) or j in moved or j in coupled
 
