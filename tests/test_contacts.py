@@ -61,6 +61,16 @@ def test_stops():
     np.testing.assert_allclose(v, [2, -first, second], rtol=1e-8)
 
 
+def test_stops_beyond_half_a_turn():
+    """Angles that poses do not tell from others are those nearest to the middle."""
+    push = lambda lower, upper, x: wheel([mb.JointStop("shaft", lower, upper, 4.0)]).terms.vf(
+        0.0, (jnp.array([x]), jnp.zeros(1)), None
+    )[1]
+    for x, expected in ((3.3, 0.0), (3.6, -1.0), (-1.2, 2.0)):
+        np.testing.assert_allclose(push(-1.0, 3.5, x), [expected], atol=1e-12)
+    np.testing.assert_allclose(push(-1.0, 3.0, 3.2), [-2.0], atol=1e-12)
+
+
 def test_friction_of_a_joint():
     """A wheel slows down: its speed above `slip` decreases evenly, and it creeps to rest."""
     joints = wheel([mb.JointFriction("shaft", 0.8, slip=0.03)])
@@ -159,9 +169,12 @@ def test_a_ball_rests_on_the_ground():
 @pytest.mark.parametrize(
     ("force", "message"),
     [
-        (mb.JointStop("shaft", 1.0, 0.5, 1.0), "`lower` must be less than `upper`, got 1.0 and 0.5"),
+        (mb.JointStop("shaft", 1.0, 0.5, 1.0), "`lower` must be less than `upper`, got 1 and 0.5"),
         (mb.JointStop("shaft", -1.0, 0.5, 0.0), "`stiffness` must be positive, got 0.0"),
-        (mb.JointStop("shaft", -1.0, jnp.nan, 1.0), "`lower` must be less than `upper`"),
+        (mb.JointStop("shaft", -1.0, jnp.nan, 1.0), "`upper` must be finite"),
+        (mb.JointStop("shaft", None, 1.0, 1.0), "`lower` must be a number, got None"),
+        (mb.JointStop("shaft", -3.0, 4.0, 1.0), "must be less than 2 pi apart.*got -3 and 4"),
+        (mb.JointStop("shaft", -jnp.inf, 6.0, 1.0), "must be less than 2 pi apart"),
         (mb.JointFriction("shaft", -1.0), "`torque` must be not negative, got -1.0"),
         (mb.JointFriction("shaft", 1.0, slip=0.0), "`slip` must be positive, got 0.0"),
         (mb.JointFriction("axle", 1.0), "names the joint 'axle', which is not there"),

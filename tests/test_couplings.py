@@ -62,7 +62,7 @@ def test_wheels_that_mesh():
         np.testing.assert_allclose(part, other, rtol=1e-11)
 
 
-def closed_linkage(coefficients, **options):
+def closed_linkage(coefficients, second=None, **options):
     """A four-bar linkage in space that moves in a plane, with a driven slider on its crank, and a wheel that is
     coupled to its rocker: equations of loops, of a drive and of a coupling, some dependent."""
     inertia, across = (0.1, 0.2, 0.2), (0.0, 1.0, 0.0)
@@ -79,7 +79,9 @@ def closed_linkage(coefficients, **options):
         hinge(mb.GROUND, "rocker", (1.0, 0, 0), "out"),
         hinge(mb.GROUND, "wheel", (3.0, 0, 0), "shaft"),
         mb.Prismatic("crank", "slider", at=(0.1, 0, 0.3), axis=(0.2, 0, 0.4), name="guide"),
-        mb.Coupling("shaft", "out", coefficients),
+        mb.Coupling("shaft", "out", coefficients)
+        if second is None
+        else mb.Coupling("out", second, 0.5),
         mb.Drive("guide", lambda t, args: 0.1 * (1 - jnp.cos(3 * t))),
     ]
     return mb.Assembly(bodies, joints, gravity=(0.0, 0.0, -9.81), **options)
@@ -161,6 +163,32 @@ def test_a_rod_without_mass_in_a_loop():
     np.testing.assert_allclose(sizes, [theirs.position[1, 0], theirs.orientation[0]], rtol=1e-10)
 
 
+def test_a_loop_closed_by_a_link_without_mass():
+    """In space, drawn where what the link without mass does is not seen in the motions of the others: the
+    equations left out are those that depend on others all the same."""
+    points = [np.array(point) for point in ((0, 0, 0), (0.3, 0, 0.8), (1.5, 0, 0), (1.0, 0, 0))]
+    names, masses = [mb.GROUND, "crank", "coupler", "rocker", mb.GROUND], (1.0, 0.0, 1.0)
+    bodies = [
+        mb.Body(name, mass, mass * np.array([0.1, 0.2, 0.2]), position=(first + second) / 2)
+        for name, mass, first, second in zip(names[1:], masses, points, points[1:])
+    ]
+    joints = [
+        mb.Revolute(first, second, at=at, axis=(0.0, 1.0, 0.0))
+        for first, second, at in zip(names, names[1:], points)
+    ]
+    given = bodies, joints, [mb.Motor("Revolute ground-crank", 0.7)]
+    found = []
+    for assembly in (
+        mb.Assembly(*given, gravity=(0.0, 0.0, -9.81)).without_dependent_equations(),
+        mb.Assembly(*given, gravity=(0.0, 0.0, -9.81), redundant=True),
+    ):
+        linkage = mb.JointCoordinates(assembly)
+        still = jnp.zeros(3), jnp.zeros(3)
+        found.append(eqx.filter_jit(linkage.system.accelerations)(0.0, still))
+    assert np.abs(found[1]).max() > 1
+    np.testing.assert_allclose(*found, rtol=1e-10, atol=1e-10)
+
+
 def test_messages(as_a_user_meets_it):
     assembly = wheels((0.2, 0.5), -2.0)
     with pytest.raises(
@@ -193,7 +221,28 @@ def test_messages(as_a_user_meets_it):
         ValueError, match="'b': `mass` must be positive, or zero with zero `inertia`"
     ):
         mb.Body("b", 0.0, 1.0)
+    traced = jax.jit(lambda c: wheels((0.2, 0.5), (1.0, c)).couplings.coefficients)(0.5)
+    np.testing.assert_allclose(traced, [[1.0, 0.5]])
+    joints = mb.JointCoordinates(assembly)
+    with pytest.raises(
+        ValueError, match="the coupling 'mesh' does not hold for the coordinates .gap 0.3"
+    ):
+        joints.state(assembly.state(orientations={"b": 0.3}))
+    turning = assembly.state(angular_velocities={"b": 0.3})
+    with pytest.raises(ValueError, match="does not hold for the rates of coordinates"):
+        joints.state(turning)
+    # 0.5 is the ratio of the two rates in this drawing of the linkage, and in no other one.
+    singular = closed_linkage(1.0, second="in").without_dependent_equations()
+    with pytest.raises(
+        ValueError, match=r"the couplings \['Coupling out'\] depend on closed loops"
+    ):
+        mb.JointCoordinates(singular)
     linkage = closed_linkage(1.0)
+    twice = [mb.Coupling("h", "w", 2.0), mb.Coupling("w", "h", 0.5)]
+    wheel = mb.Revolute("a", "c", at=(0.0, 0.0), name="w")
+    both = mb.Assembly([bodies[0], mb.Body("c", 1.0, 1.0)], [hinge, wheel, *twice])
+    with pytest.raises(ValueError, match="the couplings .* depend on each other"):
+        mb.JointCoordinates(both)
     everywhere = [mb.Coupling("in", other, 1.0) for other in ("elbow", "wrist", "out")]
     joints = [
         mb.Revolute(mb.GROUND, "a", at=(0.0, 0.0), name="in"),

@@ -358,6 +358,12 @@ def test_what_is_left_out_on_request():
         mb.from_mujoco(xml, ignore=("joint limits",))
     with pytest.raises(ValueError, match="`model` has no body that moves"):
         mb.from_mujoco("<mujoco/>")
+    with pytest.raises(ValueError, match=r"mean nothing here: \['equality of type joint'\]"):
+        mb.from_mujoco(xml, ignore=("joint limit", "equality of type joint"))
+    both = xml.replace("<geom", '<joint name="k" axis="1 0 0"/><geom')
+    assert mb.from_mujoco(both, ignore=("joint limit",)).joint_names == ("j k",)
+    stop = mb.JointStop("j", -1.0, 1.0, 10.0)
+    assert mb.from_mujoco(both, ignore=("joint limit",), forces=[stop]).joint_names == ("j", "k")
     robot = mb.from_mujoco(xml, ignore=("joint limit",))
     assert robot.joint_names == ("j",)
     with pytest.raises(TypeError, match="sequence of words"):

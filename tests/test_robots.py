@@ -169,6 +169,37 @@ def test_a_free_base_falls():
     np.testing.assert_allclose(falling, [0, 0, -9.81], atol=1e-10)
 
 
+def test_mimics_of_a_link_without_mass():
+    """Two links mimic a third, without mass, by ratios with which they go beyond half a turn."""
+    links = "".join(
+        cases.link(name, mass, 0.2) for name, mass in (("a", 1.0), ("b", 0), ("c", 1.0))
+    )
+    mimic = '<mimic joint="middle" multiplier="{}"/>'
+    file = f"""<robot name="gears">{cases.link("base")}{links}
+    {cases.joint("left", "continuous", "base", "a", more=mimic.format(4))}
+    {cases.joint("middle", "continuous", "base", "b")}
+    {cases.joint("right", "continuous", "base", "c", more=mimic.format(-1))}</robot>"""
+    given = {"closures": {"name_mot": ["left"]}, "control": lambda t, args: args}
+    robot = mb.read_urdf(file, configuration={"middle": 1.0}, gravity=(0.0, 0.0, 0.0), **given)
+    assert robot.configuration == {"left": 4.0, "middle": 1.0, "right": -1.0}
+    joints = mb.JointCoordinates(robot.assembly)
+    a = eqx.filter_jit(joints.system.accelerations)(0.0, joints.state(), jnp.array([0.85]))
+    found = dict(zip(joints.names, a))
+    expected = 0.85 * 4 / (0.2 * (16 + 1))  # of the middle one
+    for name, ratio in (("left", 4), ("middle", 1), ("right", -1)):
+        np.testing.assert_allclose(found[name], ratio * expected, rtol=1e-12)
+
+
+def test_forces_keep_hinges_of_their_own():
+    """Hinges that would become a universal joint, but that a stop needs."""
+    links = cases.link("base") + cases.link("between") + cases.link("arm", 1.0, 0.2, 0.1)
+    file = f"""<robot name="wrist">{links}{cases.joint("h", "continuous", "base", "between")}
+    {cases.joint("k", "continuous", "between", "arm", axis=(1, 0, 0))}</robot>"""
+    assert mb.read_urdf(file).assembly.joint_names == ("h k",)
+    robot = mb.read_urdf(file, forces=[mb.JointStop("h", -1.0, 1.0, 10.0)])
+    assert set(robot.assembly.joint_names) == {"h", "k"}
+
+
 def test_links_without_mass_that_are_no_joints():
     """A link without mass between three joints, and one between two hinges of which one is damped: the limit of
     links with little mass."""
@@ -203,6 +234,8 @@ def test_a_joint_that_mimics_another():
     given = {"closures": {"name_mot": ["turn"]}, "control": lambda t, args: args}
     robot = mb.read_urdf(file, configuration={"turn": 0.8}, gravity=(0.0, 0.0, 0.0), **given)
     assert abs(robot.configuration["push"] - 0.3) < 1e-15
+    again = mb.read_urdf(file, configuration=robot.configuration, **given)
+    assert again.configuration == robot.configuration
     joints = mb.JointCoordinates(robot.assembly)
     still = jax.tree.map(jnp.zeros_like, joints.state())
     found = eqx.filter_jit(joints.system.accelerations)(0.0, still, jnp.array([0.7]))

@@ -139,6 +139,15 @@ def name_all(given: Any, base: type, what: str) -> list[tuple[Any, str]]:
     return list(zip(things, unique_names(what, names), strict=True))
 
 
+def joints_named_by(things: Iterable[Any]) -> set[str]:
+    """Return the names of the joints that forces, drives and couplings name."""
+    found: set[str] = set()
+    for thing in things:
+        found |= {getattr(thing, word) for word in ("joint", "other") if hasattr(thing, word)}
+        found |= set(getattr(thing, "joints", ()))
+    return found
+
+
 def grouped(things: Iterable[tuple], kind: Callable) -> dict[Any, zip]:
     """Group things by `kind(*thing)`, in order of first occurrence; transpose each group."""
     groups: dict[Any, list[tuple]] = {}

@@ -1,5 +1,6 @@
 """Rigid bodies: the descriptions that users give, and the arrays of all of them."""
 
+import dataclasses
 from collections.abc import Sequence
 from typing import Any
 
@@ -223,6 +224,15 @@ class Bodies(eqx.Module):
         asymmetry = jnp.max(jnp.abs(inertia - jnp.swapaxes(inertia, 1, 2)))
         symmetric = asymmetry <= 1e-6 * jnp.max(jnp.abs(inertia))
         return InvertedBlocks(matrix, inverse, symmetric, positive & jnp.all(self.mass > 0))
+
+    def with_masses(self) -> "Bodies":
+        """Return the bodies, those without mass as heavy as the heaviest: to weigh equations, where no number is
+        traced."""
+        mass, inertia = np.array(self.mass), np.array(self.inertia)
+        largest = np.abs(inertia).max() or 1.0
+        inertia[mass == 0] = largest if self.planar else largest * np.eye(3)
+        mass[mass == 0] = mass.max() or 1.0
+        return dataclasses.replace(self, mass=jnp.asarray(mass), inertia=jnp.asarray(inertia))
 
     def gyroscopic(self, q: Pose, v: Pose) -> Float[Array, "..."]:
         """Return `-8 G(p')^T I G(p) p'` of every quaternion; zeros in the plane."""

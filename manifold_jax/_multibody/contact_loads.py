@@ -20,6 +20,7 @@ _LARGEST = float(np.finfo(np.float32).max)  # limits beyond it are never reached
 class StopLaws(eqx.Module):
     """The laws of [`JointStop`][] in `k` joints."""
 
+    hinge: bool = eqx.field(static=True)
     lower: Float[Array, " k"]
     upper: Float[Array, " k"]
     stiffness: Float[Array, " k"]
@@ -37,6 +38,12 @@ class StopLaws(eqx.Module):
         return jnp.sum(self.stiffness * (below**2 + above**2)) / 2
 
     def _depths(self, x: Float[Array, " k"]) -> tuple[Float[Array, " k"], Float[Array, " k"]]:
+        if (
+            self.hinge
+        ):  # poses tell angles but for whole turns: those nearest to the middle are meant
+            has_middle = (self.lower > -_LARGEST) & (self.upper < _LARGEST)
+            middle = jnp.where(has_middle, (self.lower + self.upper) / 2, 0)
+            x = x - 2 * jnp.pi * jnp.round((x - middle) / (2 * jnp.pi))
         return jax.nn.relu(self.lower - x), jax.nn.relu(x - self.upper)
 
 
@@ -99,31 +106,41 @@ def _push(
     return stiffness * depth * jax.nn.relu(1 + dissipation * rate)
 
 
-def stop_laws(stops: tuple, names: tuple[str, ...]) -> StopLaws:
-    for stop, name in zip(stops, names, strict=True):
-        ends = stop.lower, stop.upper
-        if all(map(is_concrete, ends)) and not np.all(np.asarray(ends[0]) < np.asarray(ends[1])):
-            raise ValueError(
-                f"{name}: `lower` must be less than `upper`, got {ends[0]} and {ends[1]}."
-            )
-    limits = (_limits(word, stops, names) for word in ("lower", "upper"))
-    return StopLaws(
-        *limits,
-        _numbers("stiffness", stops, names, positive=True),
-        _numbers("dissipation", stops, names),
-    )
+def stop_laws(hinge: bool, stops: tuple, names: tuple[str, ...]) -> StopLaws:
+    lower, upper = (_limits(word, stops, names) for word in ("lower", "upper"))
+    if is_concrete(lower) and is_concrete(upper):
+        for low, high, name in zip(np.asarray(lower), np.asarray(upper), names, strict=True):
+            _check_limits(hinge, float(low), float(high), name)
+    stiffness = _numbers("stiffness", stops, names, positive=True)
+    return StopLaws(hinge, lower, upper, stiffness, _numbers("dissipation", stops, names))
+
+
+def _check_limits(hinge: bool, lower: float, upper: float, name: str) -> None:
+    if not lower < upper:
+        raise ValueError(
+            f"{name}: `lower` must be less than `upper`, got {lower:.6g} and {upper:.6g}."
+        )
+    finite = [limit for limit in (lower, upper) if abs(limit) < _LARGEST]
+    is_beyond = len(finite) == 1 and abs(finite[0]) >= np.pi
+    if hinge and (is_beyond or (len(finite) == 2 and upper - lower >= 2 * np.pi)):
+        raise ValueError(
+            f"{name}: the stops of a hinge must be less than 2 pi apart, and a single one between -pi and pi, as poses of "
+            f"bodies do not tell whole turns; got {lower:.6g} and {upper:.6g}. Leave out stops that are not reached."
+        )
 
 
 def _limits(word: str, stops: tuple, names: tuple[str, ...]) -> Float[Array, " k"]:
     found = []
     for stop, name in zip(stops, names, strict=True):
         value = getattr(stop, word)
-        value = np.clip(value, -_LARGEST, _LARGEST) if is_concrete(value) else value
+        if isinstance(value, int | float) or (is_concrete(value) and np.ndim(value) == 0):
+            is_number = isinstance(value, int | float | np.number | jax.Array | np.ndarray)
+            value = float(np.clip(value, -_LARGEST, _LARGEST)) if is_number else value
         found.append(check_shape(f"{name}: `{word}`", value, ()))
     return stack(found)
 
 
-def friction_laws(frictions: tuple, names: tuple[str, ...]) -> FrictionLaws:
+def friction_laws(hinge: bool, frictions: tuple, names: tuple[str, ...]) -> FrictionLaws:
     slip = _numbers("slip", frictions, names, positive=True)
     return FrictionLaws(_numbers("torque", frictions, names), slip)
 

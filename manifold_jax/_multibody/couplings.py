@@ -81,6 +81,7 @@ def group_couplings(groups: tuple[JointGroup, ...], given: Any) -> Couplings:
 
 def _coefficients(coupling: joints.Coupling, name: str) -> Any:
     """Return the coefficients as a vector."""
-    number = max(1, np.size(coupling.coefficients))
-    given = check_shape(f"{name}: `coefficients`", coupling.coefficients, (), (number,))
+    given = coupling.coefficients
+    number = len(given) if isinstance(given, tuple | list) else np.size(given)
+    given = check_shape(f"{name}: `coefficients`", given, (), (max(1, number),))
     return on_host(given).reshape(-1)

@@ -1,6 +1,5 @@
 """The equations of joints that do not depend on others: closed loops have more than are needed."""
 
-import dataclasses
 from collections.abc import Iterator
 from typing import Any
 
@@ -88,10 +87,7 @@ def _in_drawing(assembly: Any) -> LoopClosure:
 
 def _weighted(bodies: Bodies, J: np.ndarray) -> np.ndarray:
     """Return `J L` with `L L^T = M^-1`; as if bodies without mass had one of 1 kg."""
-    mass, inertia = np.array(bodies.mass), np.array(bodies.inertia)
-    inertia[mass == 0] = 1 if bodies.planar else np.eye(3)
-    mass[mass == 0] = 1
-    bodies = dataclasses.replace(bodies, mass=jnp.asarray(mass), inertia=jnp.asarray(inertia))
+    bodies = bodies.with_masses()
     mass = bodies.mass_matrix(bodies.drawing, bodies.inverse_inertia())
     if bodies.planar:
         return J / np.sqrt(np.asarray(mass))

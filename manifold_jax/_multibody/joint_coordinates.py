@@ -6,7 +6,6 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-import scipy.linalg
 from jaxtyping import Array, Float
 
 from .._base.types import Args, RealScalarLike
@@ -15,19 +14,18 @@ from .._mechanics import MechanicalConstraint, MechanicalSystem
 from .assembly import Assembly
 from .bodies import Pose
 from .checks import is_concrete
-from .couplings import Couplings
 from .frames import Frames
-from .joint_groups import bodies_of
 from .rotors import names_of
 from .spanning_tree import find_spanning_tree, SpanningTree
 from .start import CLOSED
 from .system import ConstantAssembly
+from .tree_checks import check_couplings, check_cycles, check_masses
+from .tree_independent import find_independent_loops
 from .tree_motion import TreeMotion
 from .tree_readings import coordinates_of, poses_of
-from .tree_system import LoopEquations, Loops, motion_of, TreeForces, TreeMass
+from .tree_system import LoopEquations, motion_of, TreeForces, TreeMass
 
 
-_DEPENDENT = 1e-9
 State = tuple[Float[Array, "*t n"], Float[Array, "*t n"]]
 
 
@@ -95,7 +93,9 @@ class JointCoordinates(eqx.Module):
                 f"`assembly`: joints with `RotorInertia` or `Coupling` form a closed loop, with {left[:12]}. One joint of "
                 "every loop must have neither: leave one out, or add the inertia of a rotor to that of a body."
             )
-        self._check_masses()
+        coordinates = self._motion.coordinates
+        check_masses(assembly, self.tree, coordinates)
+        check_cycles(assembly, coordinates)
         self.independent = None if assembly.independent is None else self._find_independent()
 
     @property
@@ -155,27 +155,6 @@ class JointCoordinates(eqx.Module):
         a = mass.solve(TreeForces(source, self.tree)(t, *y, args))
         return y[1], a + jnp.where(mass.usable, 0, jnp.nan).astype(a.dtype)
 
-    def _check_masses(self) -> None:
-        """Refuse bodies without mass at ends of the tree, which any force would accelerate without bound: those that
-        move nothing with mass, and that no loop, drive, coupling or rotor holds."""
-        assembly, tree = self.assembly, self.tree
-        if not is_concrete(assembly.bodies.mass):
-            return
-        pairs = zip(assembly.joints, tree.loops, strict=True)
-        loops = [bodies_of((group,))[:, list(own)].reshape(-1) for group, own in pairs]
-        fixed = np.append(np.asarray(assembly.bodies.mass) > 0, True)
-        fixed[np.concatenate([np.zeros(0, int), *loops])] = True
-        is_fixed = (tree.is_moved() & fixed[:-1, None]).any(axis=0)
-        held = names_of(assembly.rotors) + assembly.couplings.joints + assembly.couplings.others
-        columns = self._motion.coordinates.columns
-        free = [c.body for c in columns if not is_fixed[c.body] and c.name not in held]
-        if free:
-            names = [assembly.names[i] for i in dict.fromkeys(free)]
-            raise ValueError(
-                f"`assembly`: the bodies {names[:12]} have no mass and move none that has. Give them mass and inertia, or "
-                "weld them by `Fixed` joints."
-            )
-
     def _check(self, found: State, y: tuple[Pose, Pose]) -> None:
         ours, given = _frames(*_poses(self._motion, *found)), _frames(*y)
         for k, what in ((0, "positions"), (2, "velocities")):  # of `Frames`, linear and angular
@@ -186,58 +165,20 @@ class JointCoordinates(eqx.Module):
                     f"`y`: the {what} of {self.assembly.names[int(gap.argmax())]!r} are not those that the joints allow (gap "
                     f"{gap.max():.3g}). Make a state by `assembly.state(..., assemble=True)`."
                 )
+        check_couplings(self.assembly.couplings, self._motion.coordinates, *found)
 
     def _find_independent(self) -> tuple[int, ...] | None:
-        """Return the numbers of as many equations of loops as are independent in the drawing, `None` for all. That
-        they are so elsewhere was found by `without_dependent_equations`."""
         if not all(map(is_concrete, jtu.tree_leaves(self.assembly))):
             raise ValueError(
                 "`assembly` is one of `without_dependent_equations`, whose numbers must be known: call `JointCoordinates` outside "
                 "of `jit`, `vmap` and derivatives, and replace `assembly` inside, by `eqx.tree_at`."
             )
-        motion, groups = self._motion, self.assembly.joints
         drawing = self.assembly.bodies.drawing
-        q, _ = _coordinates_of(motion, (drawing, jtu.tree_map(jnp.zeros_like, drawing)))
-        passive = tuple(
-            () if group.motions is not None else own
-            for group, own in zip(groups, self.tree.loops, strict=True)
-        )
-        loops = Loops.of(groups, self.tree._replace(loops=passive))
-        J = np.asarray(_of_loops(motion, loops, self.assembly.couplings, q))
-        mass = eqx.filter_jit(TreeMass(ConstantAssembly(self.assembly), self.tree))(q, None)
-        sizes, modes = np.linalg.eigh(mass)
-        has_mass = sizes > _DEPENDENT * sizes.max()
-        weighted = J @ (modes[:, has_mass] / np.sqrt(sizes[has_mass]))
-        lengths = np.linalg.norm(weighted, axis=1, keepdims=True)
-        # Equations that hold whatever the coordinates are, such as those across the plane of a linkage, count as zero.
-        has_size = lengths > _DEPENDENT * lengths.max(initial=0)
-        weighted = np.where(has_size, weighted / np.where(has_size, lengths, 1), 0)
-        _, triangle, order = scipy.linalg.qr(weighted.T, mode="economic", pivoting=True)  # pyright: ignore[reportAssignmentType]
-        pivots = np.abs(np.diagonal(triangle))
-        number = int(np.sum(pivots > _DEPENDENT * pivots.max(initial=1e-300)))
-        if number == J.shape[0]:
-            return None
-        chosen = np.sort(order[:number])
-        # The equations of drives, which are all solved, are between those of loops and couplings.
-        drives = sum(len(group.attachment.names) for group in groups if group.motions is not None)
-        norms = motion.coordinates.quaternions().shape[0]
-        joints = J.shape[0] - len(self.assembly.couplings.names)
-        of_loops, of_couplings = chosen[chosen < joints], chosen[chosen >= joints] + drives
-        rest = J.shape[0] + drives + np.arange(norms)
-        rows = [of_loops, joints + np.arange(drives), of_couplings, rest]
-        return tuple(np.concatenate(rows).tolist())
+        q, _ = _coordinates_of(self._motion, (drawing, jtu.tree_map(jnp.zeros_like, drawing)))
+        return find_independent_loops(self.assembly, self._motion, q)
 
 
 # One program each, not one for each operation.
 _coordinates_of = eqx.filter_jit(coordinates_of)
 _poses = eqx.filter_jit(poses_of)
 _frames = eqx.filter_jit(Frames.of)
-
-
-@eqx.filter_jit
-def _of_loops(
-    motion: TreeMotion, loops: Loops, couplings: Couplings, q: Float[Array, " n"]
-) -> Float[Array, "m n"]:
-    at = motion.place(q)
-    rows = loops.jacobian(at, jnp.concatenate(motion.jacobians(at), axis=2))
-    return jnp.concatenate([*rows, couplings.jacobian(motion.coordinates, q)])

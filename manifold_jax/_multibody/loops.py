@@ -48,7 +48,8 @@ def close_loops(
     for part in _parts(tree, closures, free):
         x = _closed_from_starts(tree, part, x)
     _check_closed(tree, closures, x)
-    return np.where(_is_free_angle(tree, free), (x + np.pi) % (2 * np.pi) - np.pi, x)
+    is_alone = ~tree.mimics()[0].any(axis=0)
+    return np.where(_is_free_angle(tree, free) & is_alone, (x + np.pi) % (2 * np.pi) - np.pi, x)
 
 
 def _parts(tree: KinematicTree, closures: Sequence[Closure], free: np.ndarray) -> Iterator[_Part]:

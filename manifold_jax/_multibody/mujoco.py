@@ -8,6 +8,7 @@ import numpy as np
 
 from .._base.user_functions import check_function
 from .assembly import Assembly
+from .attachment import joints_named_by
 from .forces import AbstractForce, JointSpring, RotationalDamper, RotorInertia
 from .joints import AbstractRestraint
 from .mujoco_actuators import actuators, tendon_springs
@@ -35,8 +36,8 @@ def from_mujoco(
     - `model`: a `mujoco.MjModel`, a string of XML, or the path of a file.
     - `control`: `f(t, args)` returns the controls `(nu,)` of its actuators; `None` for zeros, as in
         MuJoCo.
-    - `joints`, `forces`: further ones for the [`Assembly`][], such as [`JointStop`][] for limits and
-        [`GroundContact`][].
+    - `joints`, `forces`: further ones for the [`Assembly`][], such as [`JointStop`][] for limits (which count
+        from the drawing: a `range` in the file less `qpos0`) and [`GroundContact`][].
     - `ignore`: what to leave out instead of refusing it, by the words of the error message, such as
         `("contact", "joint limit")`.
     - `redundant`: as for [`Assembly`][].
@@ -61,7 +62,7 @@ def from_mujoco(
     refuse_unsupported(mujoco, model, ignore)
     if control is not None:
         check_function("control", control, "f(t, args)")
-    tree = Tree(mujoco, model, drawing_of(mujoco, model))
+    tree = Tree(mujoco, model, drawing_of(mujoco, model), joints_named_by([*joints, *forces]))
     gravity = np.zeros(3) if disabled(mujoco, model, "GRAVITY") else model.opt.gravity
     bodies, own = tree.bodies(), tree.joints()
     if not bodies:

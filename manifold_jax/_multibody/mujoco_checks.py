@@ -86,7 +86,9 @@ def refuse_unsupported(mujoco: Any, model: Any, ignore: Sequence[str]) -> None:
 def _check_words(ignore: Sequence[str]) -> None:
     known = [*dict.fromkeys(entry[-1] for entry in (*REFUSED, *COUNTED)), *OTHERS]
     of_equality = "equality of type "
-    unknown = [word for word in ignore if word not in known and not word.startswith(of_equality)]
+    supported = [of_equality + kind for kind in ("connect", "weld", "joint")]
+    is_known = lambda word: word in known or word.startswith(of_equality)
+    unknown = [word for word in ignore if not is_known(word) or word in supported]
     if unknown:
         raise ValueError(
             f"`ignore` has words that mean nothing here: {unknown}. Those that do are {', '.join(map(repr, known))}."

@@ -1,5 +1,6 @@
 """Bodies and joints of a MuJoCo model."""
 
+from collections.abc import Collection
 from typing import Any
 
 import numpy as np
@@ -24,8 +25,9 @@ from .mujoco_state import active_couplings, coefficients_of, link_names, quatern
 class Tree:
     """Bodies and joints of a model in the pose of `drawing`."""
 
-    def __init__(self, mujoco: Any, model: Any, drawing: Any):
+    def __init__(self, mujoco: Any, model: Any, drawing: Any, named: Collection[str] = ()):
         self.mujoco, self.model, self.drawing = mujoco, model, drawing
+        self.named = named  # joints that need a coordinate of their own
         self.joint_of: dict[int, str] = {}  # joints with a coordinate, by their index
         self.balls: dict[int, tuple[str, str]] = {}  # the bodies of ball joints, by their index
 
@@ -118,7 +120,8 @@ class Tree:
         ]
         moved += list(model.wrap_objid[model.wrap_type == int(self.mujoco.mjtWrap.mjWRAP_JOINT)])
         coupled = [k for _, *pair in active_couplings(self.mujoco, model) for k in pair]
-        return any(value != 0 for value in passive) or j in moved or j in coupled
+        is_named = self.name("joint", j) in self.named
+        return is_named or any(value != 0 for value in passive) or j in moved or j in coupled
 
     def equalities(self) -> list[AbstractRestraint]:
         model = self.model

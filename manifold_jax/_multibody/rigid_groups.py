@@ -98,9 +98,11 @@ def connections(
     axes: Sequence[tuple[bool, np.ndarray, np.ndarray]],
     ends: Collection[str],
     used: Collection[str],
+    mimics: Collection[str],
 ) -> list[Connection]:
     """Return the joints between groups. Those through links without mass become one where there is such a joint;
-    links at the `ends` of loops are kept, and so are the joints that are `used` by name."""
+    links at the `ends` of loops are kept, and so are the joints that are `used` by name, of links that hang on one
+    joint only those of `mimics`."""
     found = []
     for joint in tree.order:
         own = [Axis(*axes[i]) for i in tree.columns[joint.name]]
@@ -114,14 +116,18 @@ def connections(
             found.append(Connection(joint.name, first, second, own))
     kept = {groups.of(tree.root), *ends}
     massless = [name for name in groups.members if groups.mass(name) == 0 and name not in kept]
-    found = _without_loose_ends(found, massless)
+    found = _without_loose_ends(found, massless, mimics)
     for group in massless:
         found = _merged(found, group, used)
     return found
 
 
-def _without_loose_ends(found: list[Connection], massless: Collection[str]) -> list[Connection]:
-    """Remove links without mass that hang on one joint."""
+def _without_loose_ends(
+    found: list[Connection], massless: Collection[str], mimics: Collection[str]
+) -> list[Connection]:
+    """Remove links without mass that hang on one joint, unless it mimics or is mimicked."""
+    coupled = {end for c in found if c.name in mimics for end in (c.first, c.second)}
+    massless = [group for group in massless if group not in coupled]
     while True:
         ends = [end for connection in found for end in (connection.first, connection.second)]
         loose = {group for group in massless if ends.count(group) == 1}

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array
 
 from .assembly import Assembly
+from .attachment import joints_named_by
 from .ball_joints import merge_hinges
 from .bodies import GROUND, Pose
 from .checks import check_shape
@@ -124,7 +125,8 @@ def read_urdf(
     elements = _supported(elements, ignore)
     additions = read_additions(closures, links, elements)
     mimics = {name for j in elements if j.mimic for name in (j.name, j.mimic.other)}
-    links, elements = merge_hinges(links, elements, additions.used | mimics)
+    named = joints_named_by([*joints, *forces])
+    links, elements = merge_hinges(links, elements, additions.used | mimics | named)
     motions = {joint.name: motions_of(joint, additions.joint_types) for joint in elements}
     tree = KinematicTree(links, elements, motions)
     _check_mimics(tree)
@@ -133,8 +135,9 @@ def read_urdf(
     groups = Groups(tree, additions.closures, placed)
     loops = [loop for loop in additions.closures if not loop.is_rigid]
     ends = {groups.of(link) for loop in loops for link in (loop.first, loop.second)}
-    used = {joint.name for joint in elements if joint.damping != 0} | mimics | {*additions.motors}
-    found = connections(tree, groups, axes, ends, used)
+    used = {joint.name for joint in elements if joint.damping != 0}
+    used |= mimics | named | set(additions.motors)
+    found = connections(tree, groups, axes, ends, used, mimics)
     connected = ends | {group for c in found for group in (c.first, c.second)}
     names = body_names(groups, tree.root, floating_base, connected)
     own = [joint_between(connection, names) for connection in found]
