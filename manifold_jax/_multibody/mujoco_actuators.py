@@ -15,6 +15,12 @@ from .mujoco_checks import actuator_fault, disabled, is_of_tendon, tendon_fault
 from .mujoco_tree import Tree
 
 
+# Type checkers do not know the arguments of dataclasses whose fields are `Any` in abstract bases.
+_MOTOR: Any = Motor
+_SPRING: Any = JointSpring
+_TENDON: Any = Tendon
+
+
 def actuators(tree: Tree, control: Callable | None) -> list[AbstractForce]:
     """Return the motors of actuators: the torque is `gear (gain ctrl + b0 + b1 gear x + b2 gear x')`."""
     mujoco, model, found = tree.mujoco, tree.model, []
@@ -39,22 +45,23 @@ def _actuator(tree: Tree, control: Callable | None, i: int) -> list[AbstractForc
     gear, gain = float(model.actuator_gear[i, 0]), float(model.actuator_gainprm[i, 0])
     affine = int(tree.mujoco.mjtBias.mjBIAS_AFFINE)
     bias = model.actuator_biasprm[i, :3] * (model.actuator_biastype[i] == affine)
-    limits = tuple(map(float, model.actuator_ctrlrange[i]))
-    limits = limits if model.actuator_ctrllimited[i] else (-np.inf, np.inf)
+    least, most = map(float, model.actuator_ctrlrange[i])
+    limits = (least, most) if model.actuator_ctrllimited[i] else (-np.inf, np.inf)
     is_limited = bool(model.actuator_forcelimited[i])
     if len(joints) > 1 or is_limited:
         drive = _Drive(control, int(model.actuator_ctrladr[i]), gain, limits, float(bias[0]))
         spring = dict(stiffness=-bias[1], rest=-gear * zero, damping=-bias[2])
         bounds = tuple(map(float, model.actuator_forcerange[i])) if is_limited else None
-        return [Tendon(joints, gear * coefficients, drive, **spring, limits=bounds, name=name)]
+        return [_TENDON(joints, gear * coefficients, drive, **spring, limits=bounds, name=name)]
+    joint = next(iter(joints))
     gear *= float(coefficients[0])
     zero /= float(coefficients[0])
     constant = gear * float(bias[0])
     drive = _Drive(control, int(model.actuator_ctrladr[i]), gear * gain, limits, constant)
-    found: list[Any] = [Motor(joints[0], drive, name=name)]
+    found: list[AbstractForce] = [_MOTOR(joint, drive, name=name)]
     if bias[1] != 0 or bias[2] != 0:
         stiffness, damping = -(gear**2) * bias[1], -(gear**2) * bias[2]
-        found.append(JointSpring(joints[0], stiffness, -zero, damping, name=f"{name} bias"))
+        found.append(_SPRING(joint, stiffness, -zero, damping, name=f"{name} bias"))
     return found
 
 
@@ -87,7 +94,7 @@ def tendon_springs(tree: Tree) -> list[AbstractForce]:
         spring = dict(
             stiffness=stiffness, rest=model.tendon_lengthspring[k, 0] - zero, damping=damping
         )
-        found.append(Tendon(joints, coefficients, **spring, name=tree.name("tendon", k)))
+        found.append(_TENDON(joints, coefficients, **spring, name=tree.name("tendon", k)))
     return found
 
 

@@ -26,7 +26,7 @@ def check_masses(assembly: Assembly, tree: SpanningTree, coordinates: TreeCoordi
     loops = [bodies_of((group,))[:, list(own)].reshape(-1) for group, own in pairs]
     fixed = np.append(np.asarray(assembly.bodies.mass) > 0, True)
     fixed[np.concatenate([np.zeros(0, int), *loops])] = True
-    is_fixed = (tree.is_moved() & fixed[:-1, None]).any(axis=0)
+    is_fixed = np.any(tree.is_moved() & fixed[:-1, None], axis=0)
     held = names_of(assembly.rotors) + assembly.couplings.joints + assembly.couplings.others
     columns = coordinates.columns
     free = [c.body for c in columns if not is_fixed[c.body] and c.name not in held]
