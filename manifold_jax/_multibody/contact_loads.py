@@ -38,9 +38,8 @@ class StopLaws(eqx.Module):
         return jnp.sum(self.stiffness * (below**2 + above**2)) / 2
 
     def _depths(self, x: Float[Array, " k"]) -> tuple[Float[Array, " k"], Float[Array, " k"]]:
-        if (
-            self.hinge
-        ):  # poses tell angles but for whole turns: those nearest to the middle are meant
+        if self.hinge:
+            # Poses tell angles but for whole turns: those nearest to the middle are meant.
             has_middle = (self.lower > -_LARGEST) & (self.upper < _LARGEST)
             middle = jnp.where(has_middle, (self.lower + self.upper) / 2, 0)
             x = x - 2 * jnp.pi * jnp.round((x - middle) / (2 * jnp.pi))
@@ -133,9 +132,9 @@ def _limits(word: str, stops: tuple, names: tuple[str, ...]) -> Float[Array, " k
     found = []
     for stop, name in zip(stops, names, strict=True):
         value = getattr(stop, word)
-        if isinstance(value, int | float) or (is_concrete(value) and np.ndim(value) == 0):
-            is_number = isinstance(value, int | float | np.number | jax.Array | np.ndarray)
-            value = float(np.clip(value, -_LARGEST, _LARGEST)) if is_number else value
+        is_number = isinstance(value, float | np.number | np.ndarray | jax.Array)
+        if is_number and is_concrete(value) and np.all(np.isinf(value)):
+            value = np.copysign(_LARGEST, value)
         found.append(check_shape(f"{name}: `{word}`", value, ()))
     return stack(found)
 

@@ -46,8 +46,9 @@ class JointFriction(AbstractJointForce):
     - `joint`: as for [`JointSpring`][].
     - `torque` (N m, of a slider N), not negative: that of Coulomb's law, the `frictionloss` of MJCF and the
         `friction` of URDF.
-    - `slip` (rad/s or m/s), positive: below this speed friction fades, so that a joint that would stick creeps, at
-        most at about this speed. A small one makes the equations stiff, by `torque / (inertia slip)`.
+    - `slip` (rad/s or m/s), positive: below this speed friction fades. A joint that would stick under a torque `u`
+        creeps, at the speed `slip u / sqrt(torque^2 - u^2)`. A small one makes the equations stiff, by
+        `torque / (inertia slip)`.
     """
 
     torque: Any

@@ -10,11 +10,8 @@ from .couplings import Couplings
 from .joint_groups import bodies_of
 from .rotors import names_of
 from .spanning_tree import SpanningTree
-from .start import CLOSED
+from .start import CLOSED, DEPENDENT
 from .tree_coordinates import TreeCoordinates
-
-
-_DEPENDENT = 1e-9
 
 
 def check_masses(assembly: Assembly, tree: SpanningTree, coordinates: TreeCoordinates) -> None:
@@ -67,4 +64,5 @@ def check_couplings(couplings: Couplings, coordinates: TreeCoordinates, q: Array
 
 
 def rank_of(rows: np.ndarray) -> int:
-    return int(np.linalg.matrix_rank(rows, rtol=_DEPENDENT)) if rows.size else 0
+    """Return the number of independent rows."""
+    return int(np.linalg.matrix_rank(rows, rtol=DEPENDENT)) if rows.size else 0

@@ -8,13 +8,11 @@ from jaxtyping import Array, Float
 
 from .assembly import Assembly
 from .couplings import Couplings
+from .start import DEPENDENT
 from .system import ConstantAssembly
 from .tree_checks import rank_of
 from .tree_motion import TreeMotion
 from .tree_system import Loops, TreeMass
-
-
-_DEPENDENT = 1e-9
 
 
 def find_independent_loops(
@@ -34,16 +32,16 @@ def find_independent_loops(
     weighed = eqx.tree_at(lambda assembly: assembly.bodies, assembly, with_masses)
     mass = eqx.filter_jit(TreeMass(ConstantAssembly(weighed), motion.tree))(q, None)
     sizes, modes = np.linalg.eigh(mass)
-    has_mass = sizes > _DEPENDENT * sizes.max()
+    has_mass = sizes > DEPENDENT * sizes.max()
     weighted = J @ (modes[:, has_mass] / np.sqrt(sizes[has_mass]))
     lengths = np.linalg.norm(weighted, axis=1, keepdims=True)
     # Equations that hold whatever the coordinates are, such as those across the plane of a linkage, count as zero.
-    has_size = lengths > _DEPENDENT * lengths.max(initial=0)
+    has_size = lengths > DEPENDENT * lengths.max(initial=0)
     weighted = np.where(has_size, weighted / np.where(has_size, lengths, 1), 0)
     _, triangle, order = scipy.linalg.qr(weighted.T, mode="economic", pivoting=True)  # pyright: ignore[reportAssignmentType]
     pivots = np.abs(np.diagonal(triangle))
-    number = int(np.sum(pivots > _DEPENDENT * pivots.max(initial=1e-300)))
-    _check_couplings(assembly.couplings.names, weighted, number)
+    number = int(np.sum(pivots > DEPENDENT * pivots.max(initial=1e-300)))
+    _check_couplings_with_loops(assembly.couplings.names, weighted, number)
     if number == J.shape[0]:
         return None
     chosen = np.sort(order[:number])
@@ -57,7 +55,7 @@ def find_independent_loops(
     return tuple(np.concatenate(rows).tolist())
 
 
-def _check_couplings(names: tuple[str, ...], rows: np.ndarray, rank: int) -> None:
+def _check_couplings_with_loops(names: tuple[str, ...], rows: np.ndarray, rank: int) -> None:
     """Refuse couplings that depend on loops, or on each other, in the drawing: whether they do so elsewhere is
     not known."""
     if names and rank < rank_of(rows[: rows.shape[0] - len(names)]) + len(names):
