@@ -103,6 +103,19 @@ def test_more_equations_than_components(max_steps):
     np.testing.assert_allclose(sol.ys[0] @ sol.ys[0], 1, atol=1e-14)
 
 
+def test_accelerations_in_an_equilibrium():
+    """A weight at rest at the lower end of a rod given twice, in many directions: what is left of the forces is
+    rounding, and no sign of independent equations taken for dependent ones."""
+    rod = lambda t, q, args: jnp.outer(jnp.array([1.0, 0.3]), jnp.array([q @ q - 1])).reshape(-1)
+    weight = lambda t, q, v, args: 9.81 * args
+    system = mj.MechanicalSystem(2.0, rod, weight, redundant=True)
+    directions = np.random.default_rng(0).normal(size=(200, 3))
+    directions = jnp.asarray(directions / np.linalg.norm(directions, axis=1, keepdims=True))
+    still = jnp.zeros(3)
+    found = jax.jit(jax.vmap(lambda u: system.accelerations(0.0, (u, still), u)))(directions)
+    assert jnp.max(jnp.abs(found)) < 1e-13
+
+
 def test_contradictions_and_unannounced_redundancy_are_reported():
     contradicting = lambda t, y, args: jnp.stack([y @ y - 1, y @ y - 2])
     with pytest.raises(RuntimeError, match="could not be made consistent"):

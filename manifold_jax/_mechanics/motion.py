@@ -48,6 +48,8 @@ class LagrangianForce(eqx.Module):
 
 # Largest residual of a redundant equation, relative to the size of its terms.
 _LARGEST_RESIDUAL = 0.05
+# Largest rounding of the residual, relative to free accelerations, in units of the last place.
+_ROUNDING = 1000
 
 
 class EquationsOfMotion:
@@ -92,7 +94,7 @@ class EquationsOfMotion:
             residual = multiply(self.C, accelerations) + bias
             valid &= self.factorization.solves(residual, size2)  # pyright: ignore[reportAttributeAccessIssue]
         elif self.redundant:
-            valid &= _agree(self.C, accelerations, bias)
+            valid &= _agree(self.C, accelerations, free, bias)
         return _defined(accelerations, multipliers, valid)
 
     def constrained(self, b: Float[Array, " m"]) -> Float[Array, " n"]:
@@ -116,15 +118,23 @@ def _defined(a: Float[Array, " n"], multipliers: Float[Array, " m"], valid: Bool
     return a + undefined, multipliers + undefined
 
 
-def _agree(C: Float[Array, "m n"], a: Float[Array, " n"], bias: Float[Array, " m"]) -> BoolScalar:
-    """Whether `C a = -bias`, up to the inconsistency that redundant equations have off the manifold. If
-    not, an independent equation was taken for a dependent one."""
-    C, a, bias = jax.lax.stop_gradient((C, a, bias))
+def _agree(
+    C: Float[Array, "m n"],
+    a: Float[Array, " n"],
+    free: Float[Array, " n"],
+    bias: Float[Array, " m"],
+) -> BoolScalar:
+    """Whether `C a = -bias`, up to the inconsistency that redundant equations have off the manifold, and to the
+    rounding of the `free` accelerations, which is all that is left at rest in an equilibrium. If not, an
+    independent equation was taken for a dependent one."""
+    C, a, free, bias = jax.lax.stop_gradient((C, a, free, bias))
     sizes = jnp.abs(C)
     own = sizes @ jnp.abs(a) + jnp.abs(bias)
     # For rows without motion, e.g. across the plane of a planar mechanism in space.
     largest = jnp.max(sizes, axis=1) * jnp.max(jnp.abs(a)) + jnp.max(jnp.abs(bias))
-    return jnp.all(jnp.abs(C @ a + bias) <= _LARGEST_RESIDUAL * (own + 0.02 * largest))
+    rounding = _ROUNDING * jnp.finfo(a.dtype).eps * jnp.max(sizes, axis=1) * jnp.max(jnp.abs(free))
+    most = _LARGEST_RESIDUAL * (own + 0.02 * largest) + rounding
+    return jnp.all(jnp.abs(C @ a + bias) <= most)
 
 
 def flat_force(force: Any, q: Y, x: Float[Array, " n"]) -> Float[Array, " n"]:
