@@ -46,7 +46,7 @@ def close_loops(
     where that fails, from starts beside it; those `held` stay."""
     free = np.setdiff1d(np.arange(tree.size), held)
     for part in _parts(tree, closures, free):
-        x = _closed_from_starts(tree, part, x)
+        x = _closed_from_starts(tree, part, free, x)
     _check_closed(tree, closures, x)
     is_alone = ~tree.mimics()[0].any(axis=0)
     return np.where(_is_free_angle(tree, free) & is_alone, (x + np.pi) % (2 * np.pi) - np.pi, x)
@@ -67,7 +67,9 @@ def _parts(tree: KinematicTree, closures: Sequence[Closure], free: np.ndarray) -
         yield _Part(own, matrix[rows], offset[rows], np.flatnonzero(uses[part_of == k].any(axis=0)))
 
 
-def _closed_from_starts(tree: KinematicTree, part: _Part, x: np.ndarray) -> np.ndarray:
+def _closed_from_starts(
+    tree: KinematicTree, part: _Part, free: np.ndarray, x: np.ndarray
+) -> np.ndarray:
     random, rest, found, trial = np.random.default_rng(0), tree.rest, [], x
     for _ in range(_STARTS):
         tree.rest = dict(rest)
@@ -76,7 +78,9 @@ def _closed_from_starts(tree: KinematicTree, part: _Part, x: np.ndarray) -> np.n
         if found[-1][0] <= _CLOSED:
             break
         trial = x.copy()
-        trial[part.free] += random.normal(scale=_SPREAD, size=part.free.size)
+        spread = np.zeros(x.size)
+        spread[free] = random.normal(scale=_SPREAD, size=free.size)
+        trial[part.free] += spread[part.free]
     _, x, tree.rest = min(found, key=lambda one: one[0])
     return x
 
