@@ -66,6 +66,7 @@ class Resetting(dfx.AbstractWrappedSolver):
         count, dtype = len(self.conditions), jnp.result_type(self.t0)
         return ResetState(inner_state, History.initial(count, dtype))
 
+    @eqx.filter_jit  # traced once
     def step(
         self,
         terms,
