@@ -436,8 +436,7 @@ def test_dense_solution_and_solver_state():
     np.testing.assert_allclose(reverse, forward, rtol=1e-12)
 
 
-@pytest.mark.parametrize("in_a_loop", [False, True])
-@pytest.mark.parametrize("second", ["end", "times"])
+@pytest.mark.parametrize(("second", "in_a_loop"), [("end", False), ("times", True)])
 @pytest.mark.usefixtures("traced_anew")
 def test_a_solve_that_goes_on_from_the_state_of_a_solver(second, in_a_loop, monkeypatch):
     """If only ends are saved, steps are made again from the state alone; the vector field that the

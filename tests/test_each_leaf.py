@@ -16,13 +16,12 @@ from manifold_jax import multibody as mb
 LARGE = {
     "chain of 9": lambda: mj.problems.chain(9),
     "delta robot": mj.problems.delta_robot,
-    "stewart platform": mj.problems.stewart_platform,
     "cable net": lambda: mj.problems.cable_net(3, 4),
     "falling truss": lambda: mj.problems.falling_truss(4),
     "n four-bars": lambda: mj.problems.n_four_bar(4),
     "polymer": lambda: mj.problems.polymer(12),
 }
-SLOW = ["stewart platform", "delta robot", "cable net", "falling truss", "n four-bars"]
+SLOW = ["delta robot", "cable net", "falling truss", "n four-bars"]
 
 
 def total(tree):

@@ -1,4 +1,4 @@
-"""Every problem of the gallery in lanes: three trajectories, each what it is alone."""
+"""Problems of the gallery in lanes: three trajectories, each what it is alone."""
 
 import diffrax as dfx
 import jax
@@ -6,17 +6,17 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 import pytest
+from variants import variants
 
 import manifold_jax as mj
 
 
 SIZE = 3
 # Too many operations to be written out number by number: they take the way of `diffeqsolve`.
-MAPPED = {"four-bar", "parallelogram"}
-QUICK = {"lotka-volterra", "skate"}
-PROBLEMS = [
-    pytest.param(name, marks=() if name in QUICK else pytest.mark.slow) for name in mj.problems.ALL
-]
+MAPPED = {"four-bar"}
+# One of each kind: invariants, equations on velocities, time in the constraint, matrices, mechanisms.
+QUICK = ["lotka-volterra", "skate"]
+PROBLEMS = [*QUICK, "pendulum", "car-axis", "rotation", "slider-crank", "four-bar", "heavy-top"]
 
 
 def varied(problem):
@@ -35,7 +35,7 @@ def of(i, tree):
     return jtu.tree_map(lambda x: x[i], tree)
 
 
-@pytest.mark.parametrize("name", PROBLEMS)
+@pytest.mark.parametrize("name", variants(PROBLEMS, QUICK))
 def test_each_is_what_it_is_alone(name):
     problem = mj.problems.ALL[name]()
     y0s, args = varied(problem)

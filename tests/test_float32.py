@@ -38,7 +38,11 @@ def build(name):
 
 
 @pytest.mark.parametrize(
-    "name", variants([*mj.problems.ALL, "outside"], ["pendulum", "kepler", "skate", "outside"])
+    "name",
+    variants(
+        ["pendulum", "kepler", "skate", "outside", "rotation", "parallelogram", "heavy-top"],
+        ["pendulum", "kepler", "skate", "outside"],
+    ),
 )
 def test_gallery_in_single_precision(name):
     terms, constraint, (t0, t1, y0, args) = build(name)

@@ -296,7 +296,7 @@ def groups(count, size):
     ]
 
 
-@pytest.mark.parametrize("seeds", groups(300, 30))
+@pytest.mark.parametrize("seeds", groups(120, 30))
 def test_values(seeds):
     for seed in seeds:
         try:
@@ -305,7 +305,7 @@ def test_values(seeds):
             raise AssertionError(f"function {seed}") from error
 
 
-@pytest.mark.parametrize("seeds", groups(200, 10))
+@pytest.mark.parametrize("seeds", groups(80, 10))
 def test_derivatives(seeds):
     for seed in seeds:
         try:
