@@ -160,12 +160,10 @@ def test_every_approach(hook):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("solver", [dfx.Dopri8(), dfx.Kvaerno5()], ids=str)
-def test_solvers(solver):
-    """Steps in a loop, and implicit stages. With few large steps the gradient depends on how XLA
-    rounds in either program: tolerances of 1e-6 leave 13 steps of Dopri8, equal to 1e-10 alone."""
+def test_an_implicit_solver():
+    """With few large steps the gradient depends on how XLA rounds in either program."""
     tight = dfx.PIDController(rtol=1e-9, atol=1e-9)
-    check(mj.Projected, "t0, ts, t1", solver, controller=tight, max_steps=500)
+    check(mj.Projected, "t0, ts, t1", dfx.Kvaerno5(), controller=tight, max_steps=500)
 
 
 def test_constant_steps_and_none_at_all():

@@ -215,18 +215,11 @@ def solve(dae, z0, args, **options):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("model", "guess", "args", "states"),
-    [
-        ("diode", jnp.array([0.3, 0.2, 0.0]), models.DIODE_ARGS, 4),
-        ("pendulum", jnp.array([1.3, 0.5, 0.6, -0.3, 0.0]), models.PENDULUM_ARGS, 7),
-    ],
-)
-def test_index_one(model, guess, args, states):
-    args = jax.tree.map(jnp.asarray, args)
+def test_index_one():
+    args, guess = jax.tree.map(jnp.asarray, models.DIODE_ARGS), jnp.array([0.3, 0.2, 0.0])
     ends = {}
     for form in ("ode", "index-1"):
-        dae = mj.reduce_dae(getattr(models, model), guess, args, form=form)
+        dae = mj.reduce_dae(models.diode, guess, args, form=form)
 
         def end(args, dae=dae):
             z0, _ = dae.consistent_state(0.0, guess, args)
@@ -234,7 +227,7 @@ def test_index_one(model, guess, args, states):
 
         ends[form] = jax.jit(jax.value_and_grad(lambda args, end=end: end(args)[0]))(args)
     assert isinstance(dae.terms, mj.MassMatrixTerm)
-    assert len(dae.report.states) == states
+    assert len(dae.report.states) == 4
     assert dae.report.lifted == ()
     np.testing.assert_allclose(ends["ode"][0], ends["index-1"][0], rtol=1e-8)
     for name, gradient in ends["ode"][1].items():

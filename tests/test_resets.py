@@ -175,7 +175,6 @@ SOLVERS = {
     "projected": mj.Projected(dfx.Tsit5(), CIRCLE),
     "local": mj.LocalCoordinates(dfx.Tsit5(), CIRCLE),
     "stabilized": STABILIZED,
-    "Dopri8": mj.Projected(dfx.Dopri8(), CIRCLE),
     "Kvaerno5": mj.Projected(dfx.Kvaerno5(), CIRCLE),
     "Rodas5P": mj.Projected(mj.Rodas5P(), CIRCLE),
 }
