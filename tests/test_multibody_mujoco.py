@@ -1,5 +1,7 @@
 """Assemblies from MJCF and URDF: accelerations are MuJoCo's, what is not supported is refused."""
 
+import functools
+
 import equinox as eqx
 import jax.numpy as jnp
 import multibody_cases as cases
@@ -366,6 +368,11 @@ def test_what_is_left_out_on_request():
     assert mb.from_mujoco(both, ignore=("joint limit",), forces=[stop]).joint_names == ("j", "k")
     robot = mb.from_mujoco(xml, ignore=("joint limit",))
     assert robot.joint_names == ("j",)
+    shifted = both.replace('name="j" range', 'name="j" ref="20" range')
+    robot = mb.from_mujoco(shifted, stops=functools.partial(mb.JointStop, stiffness=10.0))
+    assert robot.joint_names == ("j", "k")
+    (stops,) = (group.laws for group in robot.loads if "lower" in dir(group.laws))
+    np.testing.assert_allclose((stops.lower[0], stops.upper[0]), np.radians([-21, -19]))
     with pytest.raises(TypeError, match="sequence of words"):
         mb.from_mujoco(xml, ignore="joint limit")
     with pytest.raises(TypeError, match="`model` must be"):

@@ -200,6 +200,37 @@ def test_forces_keep_hinges_of_their_own():
     assert set(robot.assembly.joint_names) == {"h", "k"}
 
 
+def test_stops_at_the_limits_of_the_file(as_a_user_meets_it):
+    """They count from the drawing; hinges that have them stay single."""
+    limit = '<limit lower="-0.4" upper="1.0" effort="0" velocity="0"/>'
+    links = cases.link("base") + cases.link("between") + cases.link("arm", 1.0, 0.2, 0.1)
+    first = cases.joint("h", "revolute", "base", "between", more=limit)
+    second = cases.joint("k", "continuous", "between", "arm", axis=(1, 0, 0))
+    file = f'<robot name="wrist">{links}{first}{second}</robot>'
+    given, seen = dict(configuration={"h": 0.3}, gravity=(0.0, 0.0, 0.0)), []
+
+    def stop(*of):
+        seen.append(of)
+        return mb.JointStop(*of, stiffness=7.0)
+
+    robot = mb.read_urdf(file, stops=stop, **given)
+    ((name, lower, upper),) = seen
+    assert (name, robot.limits) == ("h", {"h": (-0.4, 1.0)})
+    np.testing.assert_allclose((lower, upper), (-0.7, 0.7), rtol=1e-15)
+    assert set(robot.assembly.joint_names) == {"h", "k"}
+    joints = mb.JointCoordinates(robot.assembly)
+    push = lambda x: joints.terms.vf(0.0, (jnp.array([x, 0.0]), jnp.zeros(2)), None)[1][0]
+    beyond = jnp.array([-0.9, 0.69, 0.8])
+    back = jax.jit(jax.vmap(push))(beyond)
+    assert back[1] == 0
+    np.testing.assert_allclose(back[0] / back[2], -2.0, rtol=1e-12)
+    assert mb.read_urdf(file, stops=lambda *of: None, **given).assembly.joint_names
+    with pytest.raises(TypeError, match="`stops` must return a force .* 'h' it returned float"):
+        mb.read_urdf(file, stops=lambda *of: 3.0, **given)
+    with pytest.raises(TypeError, match=r"`stops` must be a callable `f\(joint, lower, upper\)`"):
+        mb.read_urdf(file, stops=mb.JointStop, **given)
+
+
 def test_links_without_mass_that_are_no_joints():
     """A link without mass between three joints, and one between two hinges of which one is damped: the limit of
     links with little mass."""

@@ -1,10 +1,12 @@
 """Contacts that yield, and friction, as users describe them: forces that are continuous, so that any solver takes
 them. Contacts that do not yield are resets, see `mj.impact`."""
 
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import equinox as eqx
 
+from .._base.user_functions import check_function
 from .forces import AbstractForce, AbstractJointForce
 
 
@@ -87,3 +89,23 @@ class GroundContact(AbstractForce):
     at: Any = None
     normal: Any = None
     name: str | None = eqx.field(static=True, default=None)
+
+
+def stops_at(
+    stops: Callable | None, limits: Mapping[str, tuple[float, float]]
+) -> list[AbstractForce]:
+    """Return what `stops(joint, lower, upper)` makes of the limits of joints, counted from the drawing."""
+    if stops is None:
+        return []
+    check_function("stops", stops, "f(joint, lower, upper)")
+    found = []
+    for name, ends in limits.items():
+        made = stops(name, *map(float, ends))
+        if isinstance(made, AbstractForce):
+            found.append(made)
+        elif made is not None:
+            raise TypeError(
+                f"`stops` must return a force such as `mj.multibody.JointStop`, or None for no stop; for the joint {name!r} "
+                f"it returned {type(made).__name__}."
+            )
+    return found

@@ -9,10 +9,11 @@ import numpy as np
 from .._base.user_functions import check_function
 from .assembly import Assembly
 from .attachment import joints_named_by
+from .contacts import stops_at
 from .forces import AbstractForce, JointSpring, RotationalDamper, RotorInertia
 from .joints import AbstractRestraint
 from .mujoco_actuators import actuators, tendon_springs
-from .mujoco_checks import disabled, import_mujoco, refuse_unsupported
+from .mujoco_checks import disabled, import_mujoco, limited_joints, name_of, refuse_unsupported
 from .mujoco_state import drawing_of
 from .mujoco_tree import Tree
 
@@ -23,6 +24,7 @@ def from_mujoco(
     control: Callable | None = None,
     joints: Sequence[AbstractRestraint] = (),
     forces: Sequence[AbstractForce] = (),
+    stops: Callable | None = None,
     ignore: Sequence[str] = (),
     redundant: bool = False,
 ) -> Assembly:
@@ -36,8 +38,9 @@ def from_mujoco(
     - `model`: a `mujoco.MjModel`, a string of XML, or the path of a file.
     - `control`: `f(t, args)` returns the controls `(nu,)` of its actuators; `None` for zeros, as in
         MuJoCo.
-    - `joints`, `forces`: further ones for the [`Assembly`][], such as [`JointStop`][] for limits (which count
-        from the drawing: a `range` in the file less `qpos0`) and [`GroundContact`][].
+    - `joints`, `forces`: further ones for the [`Assembly`][], such as [`GroundContact`][].
+    - `stops`: `f(joint, lower, upper)` returns the force at the limits (rad or m, counted from the drawing: its `range`
+        less `qpos0`) of a limited hinge or slide, or `None`; such as `functools.partial(mb.JointStop, stiffness=1e3)`.
     - `ignore`: what to leave out instead of refusing it, by the words of the error message, such as
         `("contact", "joint limit")`.
     - `redundant`: as for [`Assembly`][].
@@ -53,26 +56,31 @@ def from_mujoco(
     [`JointCoordinates`][] of the result. But two perpendicular hinges through one point are a universal
     joint, and hinge and slide on one axis a cylindrical one, if nothing acts on one of them alone.
 
-    **Raises** `ValueError` with the names of all elements that are not supported: tendons, contacts,
-    limits, friction, and so on. Elements without effect on the motion (geometries that do not
-    collide, sites, sensors, cameras) is left out.
+    **Raises** `ValueError` with the names of all elements that are not supported: spatial tendons, contacts,
+    limits without `stops`, friction, and so on. Elements without effect on the motion (geometries that do not
+    collide, sites, sensors, cameras) are left out.
     """
     mujoco = import_mujoco()
     model = load(mujoco, model)
-    refuse_unsupported(mujoco, model, ignore)
+    refuse_unsupported(mujoco, model, ignore, stops is not None)
     if control is not None:
         check_function("control", control, "f(t, args)")
-    tree = Tree(mujoco, model, drawing_of(mujoco, model), joints_named_by([*joints, *forces]))
+    limited = [] if stops is None else limited_joints(mujoco, model)
+    named = joints_named_by([*joints, *forces])
+    named |= {name_of(mujoco, model, "joint", j) for j in limited}
+    tree = Tree(mujoco, model, drawing_of(mujoco, model), named)
     gravity = np.zeros(3) if disabled(mujoco, model, "GRAVITY") else model.opt.gravity
     bodies, own = tree.bodies(), tree.joints()
     if not bodies:
         raise ValueError(
             "`model` has no body that moves: joints and free bodies belong in its `worldbody`."
         )
+    acting = [*_passive_forces(tree), *actuators(tree, control), *tendon_springs(tree)]
+    acting += stops_at(stops, {tree.joint_of[j]: _limits(tree, j) for j in limited})
     return Assembly(
         bodies,
         [*own, *tree.equalities(), *joints],
-        [*_passive_forces(tree), *actuators(tree, control), *tendon_springs(tree), *forces],
+        [*acting, *forces],
         gravity=gravity,
         redundant=redundant,
     )
@@ -88,6 +96,12 @@ def load(mujoco: Any, model: Any) -> Any:
             f"`model` must be a `mujoco.MjModel`, a string of XML or the path of a file, got {type(model).__name__}."
         )
     return mujoco.MjModel.from_xml_string(model)
+
+
+def _limits(tree: Tree, j: int) -> tuple[float, float]:
+    """Return the limits of a hinge or slide, counted from the drawing."""
+    lower, upper = tree.model.jnt_range[j] - tree.drawing.qpos[tree.model.jnt_qposadr[j]]
+    return float(lower), float(upper)
 
 
 def _passive_forces(tree: Tree) -> list[AbstractForce]:

@@ -64,13 +64,26 @@ def name_of(mujoco: Any, model: Any, kind: str, i: Index) -> str:
     return mujoco.mj_id2name(model, code, int(i)) or f"{kind} {i}"
 
 
-def refuse_unsupported(mujoco: Any, model: Any, ignore: Sequence[str]) -> None:
+def limited_joints(mujoco: Any, model: Any) -> list[int]:
+    """Return the hinges and slides with limits."""
+    if disabled(mujoco, model, "LIMIT"):
+        return []
+    has_one_coordinate = model.jnt_type >= int(mujoco.mjtJoint.mjJNT_SLIDE)
+    return [int(j) for j in np.flatnonzero((model.jnt_limited != 0) & has_one_coordinate)]
+
+
+def refuse_unsupported(
+    mujoco: Any, model: Any, ignore: Sequence[str], has_stops: bool = False
+) -> None:
+    """Refuse what is not supported; limits of hinges and slides are with stops."""
     if isinstance(ignore, str):
         raise TypeError(f"`ignore` must be a sequence of words, write `ignore=({ignore!r},)`.")
     _check_words(ignore)
     found: dict[str, list[str]] = {}
+    stopped = limited_joints(mujoco, model) if has_stops else []
+    allowed = {("joint limit", name_of(mujoco, model, "joint", j)) for j in stopped}
     for word, name in _unsupported(mujoco, model):
-        if word not in ignore:
+        if word not in ignore and (word, name) not in allowed:
             found.setdefault(word, []).append(name)
     if found:
         listed = "; ".join(

@@ -26,7 +26,7 @@ from .loops import close_loops, Closure
 from .rigid_groups import body_names, connections, Groups, joint_between
 from .rotations import rotation_matrix
 from .urdf_elements import Joint, Placement, read_elements
-from .urdf_forces import dampers_of, motors_of
+from .urdf_forces import dampers_of, motors_of, stops_of
 
 
 class LinkFrame(NamedTuple):
@@ -45,8 +45,8 @@ class Robot(eqx.Module):
     - `assembly`: the [`Assembly`][manifold_jax.multibody.Assembly], drawn with all loops closed.
     - `configuration`: the coordinates (rad or m) of hinges and sliders in the drawing, by the names
         of the file. `assembly.joint_coordinates` counts from there.
-    - `limits`: lower and upper limits of these in the file. They are not enforced: a
-        [`JointStop`][manifold_jax.multibody.JointStop] yields, an [`impact`][manifold_jax.impact] does not.
+    - `limits`: lower and upper limits of these in the file. They are not enforced
+        without `stops`, which yield; an [`impact`][manifold_jax.impact] does not.
     - `motors`: the names of joints with motors, in the order of the values of `control`.
     - `frames`: for every link of the file its body, and origin `at` and rotation of its frame in the
         drawing. `markers={"foot": robot.frames["foot"][:2]}` draws the path of its origin.
@@ -81,6 +81,7 @@ def read_urdf(
     control: Callable | None = None,
     joints: Sequence[AbstractRestraint] = (),
     forces: Sequence[AbstractForce] = (),
+    stops: Callable | None = None,
     gravity: Any = (0.0, 0.0, -9.81),
     ignore: Sequence[str] = (),
 ) -> Robot:
@@ -111,6 +112,9 @@ def read_urdf(
     - `control`: `f(t, args)` returns the torques or forces `(number of motors,)` of the motors; `None`
         for none.
     - `joints`, `forces`: further ones for the [`Assembly`][], such as [`Drive`][] and [`Motor`][].
+    - `stops`: `f(joint, lower, upper)` returns the force at the limits (rad or m, counted from the drawing) of a hinge
+        or slider in the file, or `None`; such as `functools.partial(mb.JointStop, stiffness=1e3)`. Without it limits
+        are not enforced.
     - `gravity` (m/s^2).
     - `ignore`: what to leave out, some of `("friction", "mimic")`: Coulomb friction is not supported; joints
         that mimic others are a [`Coupling`][] with them, which needs [`JointCoordinates`][].
@@ -125,7 +129,8 @@ def read_urdf(
     elements = _supported(elements, ignore)
     additions = read_additions(closures, links, elements)
     mimics = {name for j in elements if j.mimic for name in (j.name, j.mimic.other)}
-    named = joints_named_by([*joints, *forces])
+    limits = {joint.name: joint.limits for joint in elements if joint.limits is not None}
+    named = joints_named_by([*joints, *forces]) | (set(limits) if stops else set())
     links, elements = merge_hinges(links, elements, additions.used | mimics | named)
     motions = {joint.name: motions_of(joint, additions.joint_types) for joint in elements}
     tree = KinematicTree(links, elements, motions)
@@ -142,7 +147,9 @@ def read_urdf(
     names = body_names(groups, tree.root, floating_base, connected)
     own = [joint_between(connection, names) for connection in found]
     own += _ball_joints(additions.closures, groups, names, placed)
+    drawn = _coordinates(tree, x)
     acting = dampers_of(elements, own) + motors_of(additions.motors, own, control)
+    acting += stops_of(stops, limits, drawn, own)
     bodies = [groups.body(group) for group in names if names[group] != GROUND]
     if not bodies:
         raise ValueError("`file` has no link with mass that moves.")
@@ -150,8 +157,8 @@ def read_urdf(
     assembly = Assembly(bodies, joints, [*acting, *forces], gravity=gravity)
     return Robot(
         assembly.without_dependent_equations(),
-        _coordinates(tree, x),
-        {joint.name: joint.limits for joint in elements if joint.limits is not None},
+        drawn,
+        limits,
         additions.motors,
         _frames(groups, names, placed),
     )

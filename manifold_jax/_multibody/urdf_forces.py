@@ -1,6 +1,6 @@
-"""Dampers and motors in the joints of a URDF file."""
+"""Dampers, motors and stops in the joints of a URDF file."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -9,13 +9,14 @@ from jaxtyping import Array, Float
 from .._base.types import Args, RealScalarLike
 from .._base.user_functions import check_function
 from .checks import floating
+from .contacts import stops_at
 from .forces import AbstractForce, JointSpring, Motor
 from .joints import AbstractJoint, Prismatic, Revolute
 from .urdf_elements import Joint
 
 
 def dampers_of(elements: Sequence[Joint], joints: Sequence[AbstractJoint]) -> list[AbstractForce]:
-    single = {joint.name for joint in joints if isinstance(joint, Revolute | Prismatic)}
+    single = _hinges_and_sliders(joints)
     damped = [joint for joint in elements if joint.damping != 0]
     if lost := [joint.name for joint in damped if joint.name not in single]:
         raise ValueError(
@@ -29,6 +30,29 @@ def dampers_of(elements: Sequence[Joint], joints: Sequence[AbstractJoint]) -> li
     return found
 
 
+def stops_of(
+    stops: Callable | None,
+    limits: Mapping[str, tuple[float, float]],
+    drawn: Mapping[str, float],
+    joints: Sequence[AbstractJoint],
+) -> list[AbstractForce]:
+    """Return the stops at limits, those of joints that are a hinge or slider here as in the file."""
+    single = _hinges_and_sliders(joints)
+    return stops_at(
+        stops,
+        {
+            name: (a - drawn[name], b - drawn[name])
+            for name, (a, b) in limits.items()
+            if name in single
+        },
+    )
+
+
+def _hinges_and_sliders(joints: Sequence[AbstractJoint]) -> set[str]:
+    single = (joint for joint in joints if isinstance(joint, Revolute | Prismatic))
+    return {joint.name for joint in single if joint.name is not None}
+
+
 def motors_of(
     motors: tuple[str, ...], joints: Sequence[AbstractJoint], control: Callable | None
 ) -> list[AbstractForce]:
@@ -39,7 +63,7 @@ def motors_of(
         raise ValueError(
             "`control` needs motors: name their joints in `closures`, {'name_mot': [...]}."
         )
-    single = {joint.name for joint in joints if isinstance(joint, Revolute | Prismatic)}
+    single = _hinges_and_sliders(joints)
     if passive := [name for name in motors if name not in single]:
         raise ValueError(
             f"`closures`: 'name_mot' has {passive}, which have no single coordinate for a torque or force: motors belong to "
