@@ -309,6 +309,11 @@ CHANGES = {  # of the file and the arguments, and what is said
         {},
         "'value' of the link 'left upper' must be a number",
     ),
+    "no mass": (
+        ('mass value="0.8"', 'mass value="0"'),
+        {},
+        "the link 'left upper' has moments of inertia but no mass",
+    ),
     "no such link": (
         (),
         {"closures": {"closed_loop": [["tip", "top"]], "type": ["6d"]}},

@@ -110,6 +110,10 @@ def _link(element: ElementTree.Element) -> Link:
         _number(found, name, 0.0, what) for name in ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
     )
     inertia = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+    if mass == 0 and np.any(inertia):
+        raise ValueError(
+            f"`file`: {what} has moments of inertia but no mass. Give it a mass, or leave its <inertia> out."
+        )
     return Link(name, mass, _origin(inertial, what), inertia)
 
 
