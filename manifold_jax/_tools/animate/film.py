@@ -45,7 +45,8 @@ def write_film(path: Path, task: Task, seconds: float) -> list[Take]:
     artists = [_draw(ax, take) for ax, take in zip(axes, takes, strict=True)]
     _set_limits(axes[0], takes)
     title = figure.suptitle(task.problem.name)
-    figure.draw_without_rendering()
+    for _ in range(2):  # with equal scales one pass leaves no room for the labels below
+        figure.draw_without_rendering()
     figure.set_layout_engine("none")  # only the mechanism moves
 
     def show(frame: int) -> list[Any]:
