@@ -129,6 +129,33 @@ def test_a_free_body_on_links_without_mass():
     assert assembly.without_dependent_equations().independent is None
 
 
+def test_motions_of_links_without_mass_alone_are_refused():
+    """Two hinges about one axis through a link without mass, and the same with one of them held by a drive; a
+    rod between two ball joints, whose spin is unknown."""
+    body = mb.Body("body", 2.0, 0.3, position=(0.5, 0.0))
+    link = mb.Body("link", 0.0, 0.0)
+    hinges = [
+        mb.Revolute(mb.GROUND, "link", at=(0.0, 0.0), name="h"),
+        mb.Revolute("link", "body", at=(0.0, 0.0), name="k"),
+    ]
+    with pytest.raises(ValueError, match=r"joints \['h', 'k'\] can move bodies without mass"):
+        mb.JointCoordinates(mb.Assembly([link, body], hinges))
+    drive = mb.Drive("h", lambda t, args: args["rate"] * t)
+    joints = mb.JointCoordinates(mb.Assembly([link, body], [*hinges, drive]))
+    y = jnp.zeros(2), jnp.array([0.5, 0.2])
+    a = joints.system.accelerations(0.0, y, {"rate": jnp.asarray(0.5)})
+    np.testing.assert_allclose(a, 0.0, atol=1e-12)
+    inertia = (0.1, 0.2, 0.2)
+    bodies = [mb.Body("a", 1.0, inertia), mb.Body("rod", 0.0, np.zeros(3), position=(0.5, 0, 0))]
+    bodies += [mb.Body("b", 1.0, inertia, position=(1.0, 0, 0.2))]
+    balls = [
+        mb.Spherical("a", "rod", at=(0.0, 0, 0), name="first"),
+        mb.Spherical("rod", "b", at=(1.0, 0, 0), name="second"),
+    ]
+    with pytest.raises(ValueError, match="can move bodies without mass"):
+        mb.JointCoordinates(mb.Assembly(bodies, balls))
+
+
 def test_a_rod_without_mass_in_a_loop():
     """A slider-crank whose rod has no mass moves as one with a `Distance` instead."""
     crank = mb.Body("crank", 1.0, 0.1, position=(0.5, 0.0))

@@ -26,7 +26,7 @@ def find_independent_loops(
         for group, own in zip(groups, motion.tree.loops, strict=True)
     )
     loops = Loops.of(groups, motion.tree._replace(loops=passive))
-    J = np.asarray(_of_loops(motion, loops, assembly.couplings, q))
+    J = np.asarray(rows_of_loops(motion, loops, assembly.couplings, q))
     # Links without mass count as if they had some: equations that differ in their motions alone are independent.
     with_masses = assembly.bodies.with_masses()
     weighed = eqx.tree_at(lambda assembly: assembly.bodies, assembly, with_masses)
@@ -66,7 +66,7 @@ def _check_couplings_with_loops(names: tuple[str, ...], rows: np.ndarray, rank: 
 
 
 @eqx.filter_jit
-def _of_loops(
+def rows_of_loops(
     motion: TreeMotion, loops: Loops, couplings: Couplings, q: Float[Array, " n"]
 ) -> Float[Array, "m n"]:
     at = motion.place(q)
