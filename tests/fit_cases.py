@@ -69,52 +69,6 @@ def damped_pendulum():
     return Case(system, truth, np.linspace(0, 2.5, 51), (0.01, 0.05), options)
 
 
-def _rods(t, q, args):
-    return (
-        jnp.sum(jnp.diff(q, axis=0, prepend=jnp.zeros((1, 2))) ** 2, axis=1) - args["lengths"] ** 2
-    )
-
-
-def _masses(q, args):
-    return jnp.repeat(args["masses"], 2)
-
-
-def _pushed(t, q, v, args):
-    """Motion without a known force has no scale of mass."""
-    push = jnp.stack([3 * jnp.cos(2 * t), 0 * t])
-    weight = -9.81 * args["masses"][:, None] * jnp.array([[0.0, 1.0]])
-    return weight + jnp.array([[0.0], [1.0]]) * push[None, :]
-
-
-def _bent(args):
-    angle = jnp.array([np.pi / 4, -np.pi / 4])
-    links = args["lengths"][:, None] * jnp.stack([jnp.sin(angle), -jnp.cos(angle)], axis=1)
-    return jnp.cumsum(links, axis=0), jnp.zeros((2, 2))
-
-
-def pushed_double_pendulum():
-    system = mj.MechanicalSystem(_masses, _rods, _pushed)
-    truth = {"masses": np.array([1.0, 0.8]), "lengths": np.array([1.0, 0.7])}
-    options = dict(y0=_bent, positive=True)
-    return Case(system, truth, np.linspace(0, 2, 41), (0.01, 0.05), options)
-
-
-def _body(ratios):
-    """Moments of inertia `1, r, s`, started with known angular velocities."""
-    inertia = jnp.stack([jnp.ones_like(ratios["r"]), ratios["r"], ratios["s"]])
-    problem = mj.problems.rigid_body(inertia=inertia)
-    return problem.with_initial(inertia * jnp.array([0.5, 0.3, 1.2]))
-
-
-def _gyroscope(t, y, ratios):
-    return y / jnp.stack([jnp.ones_like(ratios["r"]), ratios["r"], ratios["s"]])
-
-
-def rigid_body():
-    options = dict(observe=_gyroscope, positive=True)
-    return Case(_body, {"r": 0.6, "s": 0.4}, np.linspace(0, 10, 51), 0.01, options)
-
-
 def slider_crank():
     truth = {"stiffness": 1.0, "damping": 1.0}
     return Case(
@@ -124,8 +78,6 @@ def slider_crank():
 
 ALL = {
     "pendulum": damped_pendulum,
-    "double-pendulum": pushed_double_pendulum,
-    "rigid-body": rigid_body,
     "slider-crank": slider_crank,
 }
 

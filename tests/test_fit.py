@@ -401,7 +401,7 @@ def in_a_process(case):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["pendulum", "slider-crank"])
+@pytest.mark.parametrize("name", fit_cases.ALL)
 def test_two_standard_errors_cover_the_truth(name):
     share, error_without_noise = in_a_process(name)
     assert min(share.values()) >= 0.85, share

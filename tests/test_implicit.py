@@ -112,8 +112,8 @@ def test_paths_do_not_depend_on_rounding():
     q, y0 = rng.uniform(0.5, 2.0, (8, 4)), rng.normal(size=(8, 4))
     y0 /= np.sqrt(np.sum(q * y0**2, axis=1))[:, None]
     cases = [jnp.asarray(x) for x in (A, d, q, y0)]
-    single = optimized_jit(lambda *case: quadric(*case))
-    ends, steps = optimized_jit(jax.vmap(lambda *case: quadric(*case)))(*cases)
+    single = optimized_jit(quadric)
+    ends, steps = optimized_jit(jax.vmap(quadric))(*cases)
     for i in range(8):
         end, number = single(*[x[i] for x in cases])
         assert number == steps[i]

@@ -371,8 +371,11 @@ def test_what_is_left_out_on_request():
     shifted = both.replace('name="j" range', 'name="j" ref="20" range')
     robot = mb.from_mujoco(shifted, stops=functools.partial(mb.JointStop, stiffness=10.0))
     assert robot.joint_names == ("j", "k")
-    (stops,) = (group.laws for group in robot.loads if "lower" in dir(group.laws))
+    (stops,) = (group.laws for group in robot.loads if hasattr(group.laws, "lower"))
     np.testing.assert_allclose((stops.lower[0], stops.upper[0]), np.radians([-21, -19]))
+    ball = BODY.format('<joint type="ball" range="0 1" limited="true"/>', QUIET, "", "")
+    with pytest.raises(ValueError, match="joint limit"):
+        mb.from_mujoco(ball, stops=functools.partial(mb.JointStop, stiffness=10.0))
     with pytest.raises(TypeError, match="sequence of words"):
         mb.from_mujoco(xml, ignore="joint limit")
     with pytest.raises(TypeError, match="`model` must be"):

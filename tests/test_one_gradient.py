@@ -112,7 +112,7 @@ def test_one_gradient_at_all_tolerances(hook):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("hook", "solver", "alone"),
-    [("plain", "Kvaerno5", True), ("projected", "KenCarp4", False)],
+    [("plain", "Kvaerno5", True), ("projected", "KenCarp4", False), ("tangent", "Kvaerno5", False)],
 )
 def test_one_gradient_of_implicit_solvers(hook, solver, alone):
     """With additive methods the gradients of Diffrax's default adjoint are plainly wrong."""

@@ -19,11 +19,11 @@ from .rotors import names_of
 from .spanning_tree import find_spanning_tree, SpanningTree
 from .start import CLOSED
 from .system import ConstantAssembly
-from .tree_checks import check_couplings, check_cycles, check_inertia, check_masses
-from .tree_independent import find_independent_loops, rows_of_loops
+from .tree_checks import check_couplings, check_cycles, check_masses
+from .tree_independent import check_light_motions, find_independent_loops
 from .tree_motion import TreeMotion
 from .tree_readings import coordinates_of, poses_of
-from .tree_system import LoopEquations, Loops, motion_of, TreeForces, TreeMass
+from .tree_system import LoopEquations, motion_of, TreeForces, TreeMass
 
 
 State = tuple[Float[Array, "*t n"], Float[Array, "*t n"]]
@@ -66,7 +66,8 @@ class JointCoordinates(eqx.Module):
     The tree is the one with the fewest coordinates among those with all joints that have [`RotorInertia`][] or
     [`Coupling`][].
 
-    **Raises** `ValueError` where such joints form a closed loop, and for bodies without mass that move no others.
+    **Raises** `ValueError` where such joints form a closed loop, and for bodies without mass that
+    move no others, or that joints can move while nothing with mass moves.
 
     To differentiate by numbers of the assembly, replace it inside your function:
     `eqx.tree_at(lambda joints: joints.assembly, joints, changed)`.
@@ -96,7 +97,7 @@ class JointCoordinates(eqx.Module):
         coordinates = self._motion.coordinates
         check_masses(assembly, self.tree, coordinates)
         if all(map(is_concrete, jtu.tree_leaves(assembly))) and np.any(assembly.bodies.mass == 0):
-            self._check_inertia()
+            check_light_motions(assembly, self._motion)
         check_cycles(assembly, coordinates)
         self.independent = None if assembly.independent is None else self._find_independent()
 
@@ -169,30 +170,15 @@ class JointCoordinates(eqx.Module):
                 )
         check_couplings(self.assembly.couplings, self._motion.coordinates, *found)
 
-    def _check_inertia(self) -> None:
-        """In another pose than the drawing, in which axes may meet that do not elsewhere."""
-        q = self._drawn
-        q += 0.3 * np.sin(1.0 + np.arange(q.size))
-        mass = eqx.filter_jit(TreeMass(ConstantAssembly(self.assembly), self.tree))(q, None)
-        motion, loops = self._motion, Loops.of(self.assembly.joints, self.tree)
-        rows = np.asarray(rows_of_loops(motion, loops, self.assembly.couplings, q))
-        quaternions = motion.coordinates.quaternions()
-        norms = np.zeros((len(quaternions), q.size))
-        np.put_along_axis(norms, quaternions, np.asarray(q)[quaternions], axis=1)
-        check_inertia(self.names, np.asarray(mass), np.concatenate([rows, norms]))
-
-    @property
-    def _drawn(self) -> Float[Array, " n"]:
-        drawing = self.assembly.bodies.drawing
-        return _coordinates_of(self._motion, (drawing, jtu.tree_map(jnp.zeros_like, drawing)))[0]
-
     def _find_independent(self) -> tuple[int, ...] | None:
         if not all(map(is_concrete, jtu.tree_leaves(self.assembly))):
             raise ValueError(
                 "`assembly` is one of `without_dependent_equations`, whose numbers must be known: call `JointCoordinates` outside "
                 "of `jit`, `vmap` and derivatives, and replace `assembly` inside, by `eqx.tree_at`."
             )
-        return find_independent_loops(self.assembly, self._motion, self._drawn)
+        drawing = self.assembly.bodies.drawing
+        q, _ = _coordinates_of(self._motion, (drawing, jtu.tree_map(jnp.zeros_like, drawing)))
+        return find_independent_loops(self.assembly, self._motion, q)
 
 
 # One program each, not one for each operation.

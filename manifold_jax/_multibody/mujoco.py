@@ -40,7 +40,8 @@ def from_mujoco(
         MuJoCo.
     - `joints`, `forces`: further ones for the [`Assembly`][], such as [`GroundContact`][].
     - `stops`: `f(joint, lower, upper)` returns the force at the limits (rad or m, counted from the drawing: its `range`
-        less `qpos0`) of a limited hinge or slide, or `None`; such as `functools.partial(mb.JointStop, stiffness=1e3)`.
+        less `qpos0`) of a limited hinge or slide, or `None` for no stop, as where the limits of a hinge are more than
+        a turn apart; such as `functools.partial(mb.JointStop, stiffness=1e3)`.
     - `ignore`: what to leave out instead of refusing it, by the words of the error message, such as
         `("contact", "joint limit")`.
     - `redundant`: as for [`Assembly`][].

@@ -35,23 +35,6 @@ def check_masses(assembly: Assembly, tree: SpanningTree, coordinates: TreeCoordi
         )
 
 
-def check_inertia(names: tuple[str, ...], mass: np.ndarray, rows: np.ndarray) -> None:
-    """Refuse joints that can turn or move bodies without mass while nothing else does: accelerations are
-    unknown then. `mass` and `rows` are of a pose in which nothing coincides that does not do so everywhere."""
-    sizes, modes = np.linalg.eigh(mass)
-    light = modes[:, sizes <= 1e-13 * sizes.max()]
-    if rank_of(rows @ light) == light.shape[1]:
-        return
-    _, values, directions = np.linalg.svd(rows @ light)
-    unknown = light @ directions[int(np.sum(values > DEPENDENT * values.max(initial=0))) :].T
-    share = np.abs(unknown).max(axis=1)
-    listed = [name for name, size in zip(names, share, strict=True) if size > 1e-3 * share.max()]
-    raise ValueError(
-        f"`assembly`: the joints {listed[:12]} can move bodies without mass while nothing with mass moves, such as two hinges "
-        "about one axis. Give these bodies mass and inertia, or leave joints out."
-    )
-
-
 def check_cycles(assembly: Assembly, coordinates: TreeCoordinates) -> None:
     """Refuse couplings that depend on each other."""
     couplings = assembly.couplings

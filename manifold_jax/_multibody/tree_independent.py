@@ -1,4 +1,5 @@
-"""The equations of loops in the coordinates of joints that do not depend on others."""
+"""Equations of loops that do not depend on others, and motions that nothing with mass takes part in, from the
+derivatives of both by the coordinates of joints."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -8,6 +9,7 @@ from jaxtyping import Array, Float
 
 from .assembly import Assembly
 from .couplings import Couplings
+from .rotors import names_of
 from .start import DEPENDENT
 from .system import ConstantAssembly
 from .tree_checks import rank_of
@@ -26,7 +28,7 @@ def find_independent_loops(
         for group, own in zip(groups, motion.tree.loops, strict=True)
     )
     loops = Loops.of(groups, motion.tree._replace(loops=passive))
-    J = np.asarray(rows_of_loops(motion, loops, assembly.couplings, q))
+    J = np.asarray(_derivatives(motion, loops, assembly.couplings, q)[1])
     # Links without mass count as if they had some: equations that differ in their motions alone are independent.
     with_masses = assembly.bodies.with_masses()
     weighed = eqx.tree_at(lambda assembly: assembly.bodies, assembly, with_masses)
@@ -65,10 +67,39 @@ def _check_couplings_with_loops(names: tuple[str, ...], rows: np.ndarray, rank: 
         )
 
 
+def check_light_motions(assembly: Assembly, motion: TreeMotion) -> None:
+    """Refuse joints that can move bodies without mass while nothing with mass and no rotor moves: the accelerations
+    would be unknown."""
+    loops, n = Loops.of(assembly.joints, motion.tree), motion.coordinates.size
+    # Not in the drawing, where axes may coincide by chance.
+    q = jnp.sin(1.0 + jnp.arange(n, dtype=assembly.bodies.mass.dtype))
+    bodies, equations = map(np.asarray, _derivatives(motion, loops, assembly.couplings, q))
+    heavy = bodies[np.asarray(assembly.bodies.mass) > 0]
+    quaternions = motion.coordinates.quaternions()
+    norms = np.zeros((len(quaternions), n))
+    np.put_along_axis(norms, quaternions, np.asarray(q)[quaternions], axis=1)
+    turned = np.eye(n)[motion.coordinates.numbers_of(names_of(assembly.rotors))]
+    rows = np.concatenate([np.moveaxis(heavy, 1, 2).reshape(-1, n), equations, norms, turned])
+    _, sizes, directions = np.linalg.svd(rows)
+    unknown = directions[int(np.sum(sizes > DEPENDENT * sizes.max(initial=0))) :]
+    if not unknown.size:
+        return
+    share = np.abs(unknown).max(axis=0)
+    names = [column.name for column in motion.coordinates.columns]
+    listed = [name for name, size in zip(names, share, strict=True) if size > 1e-3 * share.max()]
+    raise ValueError(
+        f"`assembly`: the joints {listed[:12]} can move bodies without mass while nothing with mass moves, such as two hinges "
+        "about one axis. Give these bodies mass and inertia, or leave joints out."
+    )
+
+
 @eqx.filter_jit
-def rows_of_loops(
+def _derivatives(
     motion: TreeMotion, loops: Loops, couplings: Couplings, q: Float[Array, " n"]
-) -> Float[Array, "m n"]:
+) -> tuple[Float[Array, "b n 6"], Float[Array, "m n"]]:
+    """Return those of velocities and angular velocities of bodies, and of the equations of loops and couplings, by
+    the rates of `q`."""
     at = motion.place(q)
-    rows = loops.jacobian(at, jnp.concatenate(motion.jacobians(at), axis=2))
-    return jnp.concatenate([*rows, couplings.jacobian(motion.coordinates, q)])
+    bodies = jnp.concatenate(motion.jacobians(at), axis=2)
+    rows = loops.jacobian(at, bodies)
+    return bodies, jnp.concatenate([*rows, couplings.jacobian(motion.coordinates, q)])

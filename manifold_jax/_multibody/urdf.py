@@ -45,8 +45,8 @@ class Robot(eqx.Module):
     - `assembly`: the [`Assembly`][manifold_jax.multibody.Assembly], drawn with all loops closed.
     - `configuration`: the coordinates (rad or m) of hinges and sliders in the drawing, by the names
         of the file. `assembly.joint_coordinates` counts from there.
-    - `limits`: lower and upper limits of these in the file. They are not enforced
-        without `stops`, which yield; an [`impact`][manifold_jax.impact] does not.
+    - `limits`: lower and upper limits of these in the file. Only `stops` of
+        `read_urdf` enforce them, and yield; an [`impact`][manifold_jax.impact] does not.
     - `motors`: the names of joints with motors, in the order of the values of `control`.
     - `frames`: for every link of the file its body, and origin `at` and rotation of its frame in the
         drawing. `markers={"foot": robot.frames["foot"][:2]}` draws the path of its origin.
@@ -113,8 +113,9 @@ def read_urdf(
         for none.
     - `joints`, `forces`: further ones for the [`Assembly`][], such as [`Drive`][] and [`Motor`][].
     - `stops`: `f(joint, lower, upper)` returns the force at the limits (rad or m, counted from the drawing) of a hinge
-        or slider in the file, or `None`; such as `functools.partial(mb.JointStop, stiffness=1e3)`. Without it limits
-        are not enforced.
+        or slider in the file, or `None` for no stop, as where the limits of a hinge are more than a turn apart; such
+        as `functools.partial(mb.JointStop, stiffness=1e3)`. Hinges with limits are then not joined to universal
+        joints: links without mass between them need [`JointCoordinates`][]. Without `stops` limits are not enforced.
     - `gravity` (m/s^2).
     - `ignore`: what to leave out, some of `("friction", "mimic")`: Coulomb friction is not supported; joints
         that mimic others are a [`Coupling`][] with them, which needs [`JointCoordinates`][].
@@ -130,7 +131,7 @@ def read_urdf(
     additions = read_additions(closures, links, elements)
     mimics = {name for j in elements if j.mimic for name in (j.name, j.mimic.other)}
     limits = {joint.name: joint.limits for joint in elements if joint.limits is not None}
-    named = joints_named_by([*joints, *forces]) | (set(limits) if stops else set())
+    named = joints_named_by([*joints, *forces]) | (set() if stops is None else set(limits))
     links, elements = merge_hinges(links, elements, additions.used | mimics | named)
     motions = {joint.name: motions_of(joint, additions.joint_types) for joint in elements}
     tree = KinematicTree(links, elements, motions)
