@@ -10,6 +10,7 @@ import jax.flatten_util
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.linalg
 import scipy.sparse as sp
 
 import manifold_jax as mj
@@ -359,3 +360,20 @@ assert jnp.ones(()).dtype == jnp.float32
 assert not jax.config.values["jax_platform_name"]
 """
     subprocess.run([sys.executable, "-c", program], check=True)
+
+
+def test_many_small_groups():
+    """Unknowns that are coupled in threes: all of them are eliminated, and nothing is left."""
+    A = np.array([[-1.0, 1.0, 0.0], [0.0, -2.0, 1.0], [0.5, 0.0, -3.0]])
+    y0 = jnp.asarray(np.random.default_rng(0).normal(size=(30, 3)))
+    terms = mj.MassMatrixTerm(lambda t, y, args: y @ A.T, 1.0)
+    sol = mj.diffeqsolve(
+        terms,
+        mj.Rodas5P(),
+        0.0,
+        1.0,
+        0.05,
+        y0,
+        stepsize_controller=dfx.PIDController(1e-10, 1e-10),
+    )
+    np.testing.assert_allclose(sol.ys[-1], y0 @ scipy.linalg.expm(A).T, atol=1e-9)

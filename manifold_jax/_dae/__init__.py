@@ -22,7 +22,7 @@ A pendulum, `F(t, x, x', args)` with the unknowns `x, y, u, v, lambda`, as an ex
   of equations whose derivatives cancel; both are eliminated before the analysis.
 - `layout.py`: which derivatives are states, and where each number is. `analysis.py` has all of this.
 - `compressed.py`, `samples.py`, `block_elimination.py`: the matrix of the leading derivatives, whether it is
-  nonsingular, and the pivots that are eliminated beforehand.
+  nonsingular (`condition.py` of `_linalg`), and the pivots that are eliminated beforehand.
 - `highest_derivatives.py`: the linear equations for `x'', y'', u', v', lambda`: the vector field.
 - `reduced.py`: the field of the state, and E with its first derivative and A, B where they are not
   eliminated: the manifold.

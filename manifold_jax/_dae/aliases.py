@@ -58,10 +58,15 @@ class Aliases(NamedTuple):
     def merged(self, there: np.ndarray) -> np.ndarray:
         """Reduce a Boolean array `(equations, derivatives, unknowns)` to what is left of both."""
         n, levels = there.shape[1:][::-1]
-        out = np.zeros((n, levels + int(self.shift.max(initial=0)), n), bool)
-        for k in range(n):
+        there = np.broadcast_to(there, (n, levels, n))
+        if self.equations.size == 0:
+            return there
+        there = there[self.rows]
+        out = np.zeros((len(there), levels + int(self.shift.max(initial=0)), n), bool)
+        out[:, :levels] = there
+        for k in np.setdiff1d(np.arange(n), self.roots):
             out[:, self.shift[k] : self.shift[k] + levels, self.root[k]] |= there[:, :, k]
-        return out[self.rows][:, :, self.roots]
+        return out[:, :, self.roots]
 
 
 def _candidates(example: Example, occurrence: Occurrence) -> list[Any]:

@@ -6,9 +6,11 @@ import functools
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy.sparse as sp
 from jaxtyping import Array, Float
 
 from .._base.types import Args
+from .._linalg.sparse import SMALLEST, Sparsity, sparsity_of_any, SquarePattern
 from .aliases import Aliases, lifted
 from .block_elimination import Elimination
 from .compressed import Compressed
@@ -66,13 +68,12 @@ class Analysis:
     def samples(self) -> Samples:
         states = self.layout.num_states
 
-        def matrix(t: Array, y: Array, args: Args) -> Array:
+        def entries(t: Array, y: Array, args: Args) -> Array:
             jets = self.jets(y[:states], y[states:] if self.implicit else None, 0)
-            return self.entries.matrix(
-                self.entries.derivatives(self.example.residual, t, jets, args)
-            )
+            derivatives = self.entries.derivatives(self.example.residual, t, jets, args)
+            return self.entries.entries(derivatives)
 
-        return Samples.of(jax.jit(matrix), self.example, self.layout)
+        return Samples.of(jax.jit(entries), self.entries.places, self.example, self.layout)
 
     @functools.cached_property
     def elimination(self) -> Elimination:
@@ -81,6 +82,15 @@ class Analysis:
         varies = self.layout.aliases.merged(self.occurrence.varies)
         varies = np.take_along_axis(varies, level, axis=1)[:, 0]
         return Elimination.of(structure.leading & ~varies, self.samples.matrices)
+
+    @functools.cached_property
+    def sparsity(self) -> Sparsity | None:
+        """How the equations for the leading derivatives are solved if these are many; `None` for
+        dense matrices."""
+        if len(self.elimination.other_rows) < SMALLEST:
+            return None
+        places, dtype = self.entries.places, self.example.jets[0].dtype
+        return sparsity_of_any(SquarePattern(sp.csr_matrix(places)), dtype)
 
     def jets(
         self, z: Float[Array, " a"], w: Float[Array, " b"] | None, differentiations: int

@@ -4,9 +4,11 @@ from typing import Any, Literal, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
+import scipy.sparse as sp
 from jaxtyping import Array, Float
 
 from .._base.types import BoolScalar
+from .._linalg.block_triangular import BlockTriangular
 from .._linalg.dense import Factorization, factorize, gram, UNROLL_LIMIT
 from .._linalg.pivoted import factorize_equilibrated
 from .._linalg.rows import multiply
@@ -29,7 +31,7 @@ class Elimination(NamedTuple):
     sign: Literal[-1, 0, 1]
 
     @staticmethod
-    def of(constant: np.ndarray, samples: list[np.ndarray]) -> "Elimination":
+    def of(constant: np.ndarray, samples: list[sp.csr_array]) -> "Elimination":
         """Choose pivots from samples of the matrix, and where it is constant."""
         rows, columns = _independent_pivots(constant, samples)
         n, sign = constant.shape[0], 0
@@ -39,28 +41,54 @@ class Elimination(NamedTuple):
             left = [_schur_complement(J, rows, columns, *others) for J in samples]
             definite = [s for s in (1, -1) if all(_is_definite(s * S) for S in left)]
             sign = definite[0] if definite else 0
+        others = others if sign else _in_order(samples, rows, columns, *others)
         return Elimination(rows, columns, *others, sign)  # pyright: ignore[reportCallIssue]
 
 
 def _independent_pivots(
-    constant: np.ndarray, samples: list[np.ndarray]
+    constant: np.ndarray, samples: list[sp.csr_array]
 ) -> tuple[np.ndarray, np.ndarray]:
     """Choose pivots greedily: no entry in the row or column of another."""
-    size = np.min([np.abs(J) / np.abs(J).max(axis=1, keepdims=True) for J in samples], axis=0)
-    there = np.any([J != 0 for J in samples], axis=0)
-    good = constant & (size > _SMALLEST_PIVOT)
-    rows, columns = [], []
-    for i, j in sorted(np.argwhere(good).tolist(), key=lambda ij: there[ij[0]].sum()):
-        if not there[i, columns].any() and not there[rows, j].any():
-            rows.append(i)
-            columns.append(j)
-    order = np.argsort(np.array(columns, int))
-    return np.array(rows, int)[order], np.array(columns, int)[order]
+    places = samples[0].tocoo()
+    i, j = places.row, places.col
+    sizes = np.abs([J.data for J in samples])
+    largest = np.zeros((len(samples), len(constant)))
+    np.maximum.at(largest.T, i, sizes.T)
+    size, there = np.min(sizes / largest[:, i], axis=0), np.any(sizes > 0, axis=0)
+    good = np.nonzero(constant[i, j] & (size > _SMALLEST_PIVOT))[0]
+    fewest_first = good[np.argsort(np.bincount(i[there])[i[good]], kind="stable")]
+    by_rows = sp.csr_array((np.ones(there.sum(), bool), (i[there], j[there])), constant.shape)
+    by_columns = sp.csr_array(by_rows.T)
+    pivot_rows, pivot_columns = (np.zeros(n, bool) for n in constant.shape)
+    column_of = {}
+    for row, column in zip(i[fewest_first].tolist(), j[fewest_first].tolist(), strict=True):
+        beside, below = _line(by_rows, row), _line(by_columns, column)
+        if not pivot_columns[beside].any() and not pivot_rows[below].any():
+            pivot_rows[row] = pivot_columns[column] = True
+            column_of[column] = row
+    columns = np.sort(np.array([*column_of], int))
+    return np.array([column_of[column] for column in columns.tolist()], int), columns
 
 
-def _schur_complement(J: np.ndarray, r: Any, c: Any, other_r: Any, other_c: Any) -> np.ndarray:
-    half = J[np.ix_(other_r, c)] / J[r, c]
-    return J[np.ix_(other_r, other_c)] - half @ J[np.ix_(r, other_c)]
+def _line(matrix: sp.csr_array, row: int) -> np.ndarray:
+    return matrix.indices[matrix.indptr[row] : matrix.indptr[row + 1]]
+
+
+def _in_order(
+    samples: list[sp.csr_array], r: Any, c: Any, other_r: Any, other_c: Any
+) -> list[np.ndarray]:
+    """Return the other rows and columns in an order in which the rest is block triangular: exchanges of
+    rows then stay inside of its blocks, which long chains need, in which each unknown is a multiple of
+    the one before."""
+    there = sp.csr_array(sum(abs(J) for J in samples))
+    rest = there[other_r][:, other_c] + there[other_r][:, c] @ there[r][:, other_c]
+    form = BlockTriangular.of(rest)
+    return [other_r, other_c] if form is None else [other_r[form.rows], other_c[form.columns]]
+
+
+def _schur_complement(J: sp.csr_array, r: Any, c: Any, other_r: Any, other_c: Any) -> np.ndarray:
+    half = J[other_r][:, c].toarray() / J[r][:, c].diagonal()
+    return J[other_r][:, other_c].toarray() - half @ J[r][:, other_c].toarray()
 
 
 def _is_definite(S: np.ndarray) -> bool:

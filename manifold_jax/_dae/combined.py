@@ -14,13 +14,14 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy.sparse as sp
 from jaxtyping import Array
 
 from .._jaxpr.incidence import incidence
+from .._linalg.condition import singular_below
 from .analysis import Analysis
 from .equations import EquationCombination
 from .occurrence import Example, Occurrence, tracked
-from .samples import singular_below
 
 
 # A sum counts as zero below this fraction of its terms.
@@ -106,11 +107,11 @@ def _vanishes(jacobians: list[np.ndarray], rows: np.ndarray, weights: np.ndarray
     return vanishes
 
 
-def _common_null_vectors(matrices: list[np.ndarray]) -> list[np.ndarray]:
+def _common_null_vectors(matrices: list[sp.csr_array]) -> list[np.ndarray]:
     """Return the common null vectors with few nonzero entries, the first positive, the largest of them
     1. The columns of each matrix are scaled separately: exponential functions differ by many decades
     from sample to sample."""
-    every = np.concatenate(matrices, axis=1)
+    every = sp.hstack(matrices).toarray()
     scale = np.ones(len(every))
     for _ in range(3):
         columns = np.abs(every).max(axis=0)

@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy.sparse as sp
 from jaxtyping import Array
 
 from .._base.types import Args
@@ -19,7 +20,9 @@ class Compressed(NamedTuple):
     unknowns that are left; its entries are those of derivatives along the `seeds`."""
 
     seeds: np.ndarray  # (colors, levels, n)
-    places: np.ndarray  # (rows, columns) in the flat derivatives, -1 for zero
+    places: (
+        sp.csr_array
+    )  # of the entries in the flat derivatives, counted from 1: 0 stands for no entry
 
     @staticmethod
     def of(
@@ -30,19 +33,21 @@ class Compressed(NamedTuple):
         orders = structure.sigma[rows, columns]
         pairs, which = np.unique(np.stack([orders, columns], 1), axis=0, return_inverse=True)
         which = which.ravel()
-        needed = np.zeros((len(structure.c), len(pairs)))
-        needed[rows, which] = 1
-        met = there[:, pairs[:, 0], pairs[:, 1]].astype(float)
-        colors = greedy_colors(needed.T @ met > 0, most_conflicts_first=True)
-        seeds = np.zeros((int(colors.max(initial=-1)) + 1, levels, len(aliases.root)))
-        for (order, column), color in zip(pairs, colors, strict=True):
-            for unknown in np.nonzero(aliases.columns == column)[0]:
+        shape = len(structure.c), len(pairs)
+        needed = sp.csr_array((np.ones(len(rows), int), (rows, which)), shape)
+        met = sp.csr_array(there[:, pairs[:, 0], pairs[:, 1]].astype(int))
+        colors = greedy_colors(needed.T @ met, most_conflicts_first=True)
+        n, members = len(aliases.root), [[] for _ in aliases.roots]
+        for unknown, column in enumerate(aliases.columns.tolist()):
+            members[column].append(unknown)
+        seeds = np.zeros((int(colors.max(initial=-1)) + 1, levels, n))
+        for (order, column), color in zip(pairs.tolist(), colors.tolist(), strict=True):
+            for unknown in members[column]:
                 level = order - aliases.shift[unknown]
                 if 0 <= level < levels:
                     seeds[color, level, unknown] = aliases.factor[unknown]
-        places = np.full(structure.sigma.shape, -1)
-        places[rows, columns] = colors[which] * len(aliases.root) + aliases.rows[rows]
-        return Compressed(seeds, places)
+        numbers = colors[which] * n + aliases.rows[rows] + 1
+        return Compressed(seeds, sp.csr_array((numbers, (rows, columns)), structure.sigma.shape))
 
     def derivatives(self, function: Any, t: Array, jets: tuple[Array, ...], args: Args) -> Array:
         """Return the flat array of directional derivatives, of which the entries are taken."""
@@ -51,12 +56,17 @@ class Compressed(NamedTuple):
         along = lambda *rates: jax.jvp(at, (jets,), (rates,))[1]
         return jax.vmap(along)(*seeds).ravel()
 
+    def entries(self, derivatives: Array) -> Array:
+        """Return the entries, row by row, in the order of `places`."""
+        return pick(derivatives, self.places.data - 1)
+
     def block(self, derivatives: Array, rows: np.ndarray, columns: np.ndarray) -> Array:
-        places = self.places[np.ix_(rows, columns)]
+        places = self.places[rows][:, columns].toarray() - 1
         return pick(derivatives, places.ravel()).reshape(places.shape)
 
     def diagonal(self, derivatives: Array, rows: np.ndarray, columns: np.ndarray) -> Array:
-        return pick(derivatives, self.places[rows, columns])
+        return pick(derivatives, self.places[rows][:, columns].diagonal() - 1)
 
     def matrix(self, derivatives: Array) -> Array:
-        return self.block(derivatives, *map(np.arange, self.places.shape))
+        every = np.arange(len(self.places.indptr) - 1)
+        return self.block(derivatives, every, every)

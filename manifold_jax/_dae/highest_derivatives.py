@@ -6,7 +6,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._base.types import Args
+from .._linalg.dense import Factorization
 from .._linalg.newton import AbstractEquations, implicit_root, without_derivative
+from .._linalg.sparse import factorize_sparse, SparseMatrix
 from .analysis import Analysis
 from .block_elimination import Eliminated
 from .derivatives import pick
@@ -33,9 +35,12 @@ class HighestDerivatives(AbstractEquations):
         values = self.analysis.differentiated(self.equations, self.t, jets, self.args, c, c + 1)
         return pick(values, np.argsort(np.argsort(c, kind="stable")))
 
-    def linearize(self, x: Float[Array, " n"]) -> Eliminated:
-        analysis = self.analysis
-        return Eliminated.of(analysis.elimination, analysis.entries, self._derivatives(x))
+    def linearize(self, x: Float[Array, " n"]) -> Eliminated | Factorization:
+        analysis, derivatives = self.analysis, self._derivatives(x)
+        if analysis.sparsity is None:
+            return Eliminated.of(analysis.elimination, analysis.entries, derivatives)
+        matrix = SparseMatrix(analysis.entries.entries(derivatives), analysis.sparsity.pattern)
+        return factorize_sparse(matrix, analysis.sparsity.method)
 
     def matrix(self, w: Float[Array, " n"] | None = None) -> Float[Array, "n n"]:
         return self.analysis.entries.matrix(self._derivatives(w))

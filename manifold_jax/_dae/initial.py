@@ -9,6 +9,7 @@ import jax.flatten_util as jfu
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
+import scipy.sparse as sp
 from jaxtyping import Array, Float
 
 from .._base.errors import clear_errors, listed
@@ -17,15 +18,16 @@ from .._base.types import Args, BoolScalar, FloatScalar, RealScalarLike, Y
 from .._constraint.projection_info import ProjectionInfo
 from .._constraint.residual import as_time, jacobian, row_scale
 from .._constraint.settings import NewtonProjection
+from .._linalg.condition import reciprocal_condition, singular_below
 from .._linalg.dense import gram
-from .._linalg.newton import find_root, implicit_root, SquareSystem, without_derivative
+from .._linalg.newton import find_root, implicit_root, without_derivative
 from .._linalg.pivoted import factorize_equilibrated
 from .equations import leaf_names
 from .highest_derivatives import HighestDerivatives
 from .layout import Gather, StateLayout
 from .nearest import Constrained, depends_on_fixed_only, free_components, nearest_state, with_lifted
 from .reduced import Reduced
-from .samples import condition, dependent_rows, singular_below
+from .samples import dependent_rows
 
 
 _MOST_STEPS = 100
@@ -180,12 +182,11 @@ def _solve_leading_equations(
     leading: HighestDerivatives, guess: Float[Array, " k"]
 ) -> tuple[Float[Array, " k"], BoolScalar]:
     """Return the leading derivatives near a guess, and whether they solve the equations."""
-    equations = SquareSystem(leading.residual, leading.matrix)
-    fixed, tolerance = without_derivative(equations), NewtonProjection().tolerance_for(guess.dtype)
-    found = find_root(equations, guess, _MOST_STEPS, tolerance)
+    fixed, tolerance = without_derivative(leading), NewtonProjection().tolerance_for(guess.dtype)
+    found = find_root(leading, guess, _MOST_STEPS, tolerance)
     change = fixed.linearize(found).solve(fixed.residual(found))
     small = jnp.max(jnp.abs(change) / (1 + jnp.abs(found)), initial=0) <= 1e3 * tolerance
-    return implicit_root(equations, found), jax.lax.stop_gradient(small)
+    return implicit_root(leading, found), jax.lax.stop_gradient(small)
 
 
 def _messages(guess: Guess) -> list[str]:
@@ -209,12 +210,12 @@ def _explain(
         return
     if bool(info.success) or (any(guess.fixed) and bool(nonsingular)):
         return
-    matrix = np.asarray(leading.matrix())
-    if not np.isfinite(matrix).all():
+    matrix = sp.csr_array(np.asarray(leading.matrix()))
+    if not np.isfinite(matrix.data).all():
         raise ValueError(
             "`F` or its derivatives are not finite at the start. Give an `x_guess` where they are."
         )
-    if condition(matrix) > 10 * singular_below(matrix.dtype):
+    if reciprocal_condition(matrix) > 10 * singular_below(matrix.dtype):
         return
     names = leading.equations.names.equations
     rows = leading.analysis.rows[dependent_rows(matrix)]

@@ -56,10 +56,10 @@ class StateLayout(NamedTuple):
         """Put the user's own unknowns first, in their order, then derivatives without a name."""
         n, d = len(aliases.root), structure.d
         places = np.full((int(d.max(initial=0)) + 1, len(d)), -1)
-        names = []
+        names, columns = [], aliases.columns
         for k in range(int(d.max(initial=0)) + 1):
             for unknown in range(n):
-                m, j = k + aliases.shift[unknown], aliases.columns[unknown]
+                m, j = k + aliases.shift[unknown], columns[unknown]
                 if m < d[j] and places[m, j] < 0:
                     places[m, j] = len(names)
                     names.append((k, unknown))

@@ -14,6 +14,10 @@ from .derivatives import pick
 from .equations import ResidualEquations
 
 
+# Number of inputs of which it is found at the same time where they occur.
+_AT_A_TIME = 2048
+
+
 class Example(NamedTuple):
     """Equations and a point at which they are evaluated: a time, the vectors `(x, x', ...)` and
     parameters, whose arrays can be traced."""
@@ -57,12 +61,9 @@ class Occurrence(NamedTuple):
 
     @staticmethod
     def of(example: Example) -> "Occurrence":
-        """Find the occurrence; time and parameters are one input each, after those of the jets."""
-        shape = n, levels, _ = example.equations.n, example.equations.order + 1, example.equations.n
-        each = np.eye(n * levels, n * levels + 2, dtype=bool)
-        time, parameters = np.eye(2, n * levels + 2, n * levels, dtype=bool)
-        args = tracked(example.args, parameters)
-        inputs = tracked(example.t, time), (example.jets, each), args
+        """Find the occurrence, of some unknowns at a time: sets of all of many take much memory. Time and
+        parameters count as one number each."""
+        n, levels = example.equations.n, example.equations.order + 1
 
         def rate(t: Array, jets: tuple[Array, ...], args: Any, dt: Array, rates: Any) -> Array:
             """Return the derivative along a direction. If it does not depend on a number, the
@@ -70,16 +71,31 @@ class Occurrence(NamedTuple):
             along = lambda t, jets: example.residual(t, jets, args)
             return jax.jvp(along, (t, jets), (dt, rates))[1]
 
-        values = incidence(example.residual, *inputs)
-        directions = [tracked(tree, np.zeros_like(time)) for tree in (example.t, example.jets)]
-        slopes = incidence(rate, *inputs, *directions)
+        there, varies = (np.zeros((n, levels * n + 2), bool) for _ in range(2))
+        unknown_primitives = {}
+        for start in range(0, levels * n + 2, _AT_A_TIME):
+            part = slice(start, start + _AT_A_TIME)
+            each = np.eye(
+                levels * n + 2, min(_AT_A_TIME, levels * n + 2 - start), -start, dtype=bool
+            )
+            jets, time, parameters = each[:-2], each[-2], each[-1]
+            inputs = (
+                tracked(example.t, time),
+                (example.jets, jets),
+                tracked(example.args, parameters),
+            )
+            directions = [tracked(tree, np.zeros_like(time)) for tree in (example.t, example.jets)]
+            values = incidence(example.residual, *inputs)
+            there[:, part] = values.depends
+            varies[:, part] = incidence(rate, *inputs, *directions).depends
+            unknown_primitives.update(values.unknown_primitives)
         return Occurrence(
-            there=values.depends[:, :-2].reshape(shape),
-            varies=slopes.depends[:, :-2].reshape(shape),
-            depends_on_time=values.depends[:, -2],
-            depends_on_args=values.depends[:, -1],
-            coefficients_vary=slopes.depends.any(axis=1),  # pyright: ignore[reportArgumentType]
-            unknown_primitives=values.unknown_primitives,
+            there=there[:, :-2].reshape(n, levels, n),
+            varies=varies[:, :-2].reshape(n, levels, n),
+            depends_on_time=there[:, -2],
+            depends_on_args=there[:, -1],
+            coefficients_vary=varies.any(axis=1),  # pyright: ignore[reportArgumentType]
+            unknown_primitives=unknown_primitives,
         )
 
     def without(self, before: "Occurrence", gone: dict[int, np.ndarray]) -> "Occurrence":

@@ -5,8 +5,10 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
+import scipy.sparse as sp
 from jaxtyping import Array
 
+from .._linalg.condition import equilibrated, reciprocal_condition, singular_below
 from .layout import StateLayout
 from .occurrence import Example
 
@@ -16,9 +18,9 @@ _DISTANCES = (0.5, 0.5, 0.5, 0.1, 0.01, 1e-3)
 
 
 class Samples(NamedTuple):
-    """Matrices, equilibrated, and the smallest over the largest singular value of each."""
+    """Matrices, and the reciprocal condition of each."""
 
-    matrices: list[np.ndarray]
+    matrices: list[sp.csr_array]
     conditions: list[float]
 
     @property
@@ -26,23 +28,23 @@ class Samples(NamedTuple):
         return max(self.conditions) < singular_below(self.matrices[0].dtype)
 
     @staticmethod
-    def of(matrix: Callable, example: Example, layout: StateLayout) -> "Samples":
-        """Take samples of `matrix(t, y, args)`; `y` has the states and then the leading derivatives."""
+    def of(
+        entries: Callable, places: sp.csr_array, example: Example, layout: StateLayout
+    ) -> "Samples":
+        """Take samples of `entries(t, y, args)`, those of a matrix at these places; `y` has the states and
+        then the leading derivatives."""
         matrices = []
         for t, y in _points(layout, np.asarray(example.jets[0])):
-            sample = np.asarray(matrix(t, jnp.asarray(y), example.args))
+            sample = np.asarray(entries(t, jnp.asarray(y), example.args))
             if np.isfinite(sample).all():
-                matrices.append(sample)
+                matrix = sp.csr_array((sample, places.indices, places.indptr), places.shape)
+                matrices.append(matrix)
         if not matrices:
             raise ValueError(
                 "`F` or its derivatives are not finite near `x_example` (with random numbers for its derivatives). Give "
                 "an example where F is defined, and parameters in `args_example` as they will be used."
             )
-        return Samples(matrices, [condition(matrix) for matrix in matrices])
-
-
-def singular_below(dtype: np.dtype) -> float:
-    return float(np.finfo(dtype).eps) ** 0.75
+        return Samples(matrices, [reciprocal_condition(matrix) for matrix in matrices])
 
 
 def _points(layout: StateLayout, x: np.ndarray) -> list[tuple[Array, np.ndarray]]:
@@ -56,22 +58,8 @@ def _points(layout: StateLayout, x: np.ndarray) -> list[tuple[Array, np.ndarray]
     return found
 
 
-def equilibrated(matrix: np.ndarray) -> np.ndarray:
-    for axis in (1, 0, 1, 0):
-        size = np.abs(matrix).max(axis=axis, keepdims=True)
-        matrix = matrix / np.where(size > 0, size, 1)
-    return matrix
-
-
-def condition(matrix: np.ndarray) -> float:
-    if matrix.size == 0:
-        return 1.0
-    values = np.linalg.svd(equilibrated(matrix), compute_uv=False)
-    return float(values[-1] / values[0]) if values[0] > 0 else 0.0
-
-
-def dependent_rows(matrix: np.ndarray) -> np.ndarray:
+def dependent_rows(matrix: sp.csr_array) -> np.ndarray:
     """Return the rows of a singular matrix that are part of the linear dependence."""
-    left, values, _ = np.linalg.svd(equilibrated(matrix))
+    left, values, _ = np.linalg.svd(equilibrated(matrix).toarray())
     null = left[:, values <= 1e3 * singular_below(matrix.dtype) * values[0]]
     return np.nonzero(np.abs(null).max(axis=1, initial=0) > 1e-6)[0]

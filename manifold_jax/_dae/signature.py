@@ -60,5 +60,7 @@ class DAEStructure(NamedTuple):
 def signature(occurs: np.ndarray) -> np.ndarray:
     """Return the signature matrix from `occurs[i, k, j]`: derivative `k` of unknown `j` in equation
     `i`."""
-    highest = occurs.shape[1] - 1 - np.argmax(occurs[:, ::-1], axis=1)
-    return np.where(occurs.any(axis=1), highest, ABSENT)
+    sigma = np.full(occurs[:, 0].shape, ABSENT)
+    for k in range(occurs.shape[1]):
+        sigma[occurs[:, k]] = k
+    return sigma

@@ -43,10 +43,9 @@ class AbstractEquations(eqx.Module):
 
 
 class SquareSystem(AbstractEquations):
-    """`function(z) = 0` for vectors, optionally with its matrix `dr/dz`, both pytrees."""
+    """`function(z) = 0` for vectors; the function is a pytree."""
 
     function: Callable
-    matrix: Callable | None = None
 
     def point(self, z: Float[Array, " m"]) -> Float[Array, " m"]:
         return z
@@ -55,8 +54,7 @@ class SquareSystem(AbstractEquations):
         return self.function(x)
 
     def linearize(self, x: Float[Array, " m"]) -> Factorization:
-        matrix = jax.jacfwd(self.function) if self.matrix is None else self.matrix
-        return factorize_equilibrated(matrix(x))
+        return factorize_equilibrated(jax.jacfwd(self.function)(x))
 
 
 class Iterate(NamedTuple):

@@ -28,10 +28,10 @@ from .._constraint.projection_info import ProjectionInfo
 from .._linalg.lapack import singular_values
 from .._linalg.newton import root_of_step
 from .._linalg.pivoted import factorize_pivoted
-from .._linalg.sparse import Choice
+from .._linalg.sparse import Choice, Sparsity
 from .linearized import LinearizedEquations as LinearizedEquations, relative_residual
 from .sparse_equations import linearize_sparse
-from .sparsity import choose_sparsity, Sparsity
+from .sparsity import choose_sparsity
 
 
 _MOST_ITERATIONS = 50

@@ -12,9 +12,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._base.types import RealScalarLike
-from .._linalg.sparse import factorize_sparse, SparseMatrix
+from .._linalg.sparse import factorize_sparse, SparseMatrix, Sparsity
 from .linearized import LinearizedEquations, relative_residual
-from .sparsity import Sparsity
 
 
 def linearize_sparse(

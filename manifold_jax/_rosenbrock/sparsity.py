@@ -1,7 +1,7 @@
 """Whether the linear systems of a step are solved with sparse matrices, and how."""
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -10,24 +10,19 @@ from jaxtyping import Array, Float
 
 from .._base.errors import listed
 from .._base.klu import has_klu
-from .._linalg.sparse import Choice, dependence, Method, program_of, SquarePattern
+from .._linalg.sparse import (
+    Choice,
+    dependence,
+    program_of,
+    SMALLEST,
+    SMALLEST_KLU,
+    Sparsity,
+    SquarePattern,
+)
 
 
-# Number of unknowns from which on sparse systems are solved as such. A step of the Brusselator with
-# diffusion then takes 0.48 of the time with dense matrices (0.57 with 48, 0.51 with 96), of a ladder, which is
-# tridiagonal, 0.47 (0.64, 0.21); to compile takes twice as long. jaxlib 0.10.2.
-SMALLEST = 64
-# The same for KLU: 1.7 and 1.4 times as long with 100 unknowns, 0.4 and 0.1 with 150.
-SMALLEST_KLU = 128
 # The largest number of colors as a part of the number of unknowns.
 _MOST_COLORS = 1 / 3
-
-
-class Sparsity(NamedTuple):
-    """Where the matrices of a step have entries, and how their systems are solved."""
-
-    pattern: SquarePattern
-    method: Method
 
 
 def check_structure(structure: Any) -> None:

@@ -11,10 +11,10 @@ from jaxtyping import Array, Float
 from .._base.compat import directed, time_direction, undirected
 from .._base.types import Args, RealScalarLike, Y
 from .._linalg.rows import product
-from .._linalg.sparse import Choice, SparseMatrix
+from .._linalg.sparse import Choice, SparseMatrix, Sparsity
 from .algebraic import LinearizedEquations
 from .mass_matrix import mass_values, MassMatrixTerm, ravelled_like
-from .sparsity import choose_sparsity, Sparsity
+from .sparsity import choose_sparsity
 
 
 Vector = Float[Array, " n"]

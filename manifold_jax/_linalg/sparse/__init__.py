@@ -2,6 +2,12 @@
 of block tridiagonal matrices, and square matrices by their entries."""
 
 from .direct import factorize_sparse as factorize_sparse, Method as Method
+from .method import (
+    SMALLEST as SMALLEST,
+    SMALLEST_KLU as SMALLEST_KLU,
+    Sparsity as Sparsity,
+    sparsity_of_any as sparsity_of_any,
+)
 from .pattern import dependence as dependence
 from .rows import SparseRows as SparseRows
 from .square import SparseMatrix as SparseMatrix, SquarePattern as SquarePattern
