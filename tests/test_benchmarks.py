@@ -65,6 +65,7 @@ TOO_LONG = {
     "benchmarks.peers.stiff",
     "benchmarks.speed.adaptive_gradients",
     "benchmarks.speed.bandwidths",
+    "benchmarks.speed.dae_size",
     "benchmarks.speed.gradients",
     "benchmarks.speed.overhead",
     "benchmarks.speed.scaling",
