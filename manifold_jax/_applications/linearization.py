@@ -116,19 +116,21 @@ def _derivatives(
     """Return `A`, the derivatives by `args`, and the tangent vectors as functions of the state: their values
     are those that are `kept`."""
     T = kept - G.T @ pseudo_invert(G @ G.T, _DEPENDENT**2).solve(G @ kept)
-    (x, unravel), d = jfu.ravel_pytree(y), kept.shape[1]
+    x, unravel = jfu.ravel_pytree(y)
     given, static = eqx.partition(args, eqx.is_inexact_array)
+    a, unravel_args = jfu.ravel_pytree(given)
 
-    def field(x: Float[Array, " n"], given: Any) -> Float[Array, " n"]:
-        return jfu.ravel_pytree(terms.vf(t, unravel(x), eqx.combine(given, static)))[0]
+    def field(x: Float[Array, " n"], a: Float[Array, " m"]) -> Float[Array, " n"]:
+        full = eqx.combine(unravel_args(a), static)
+        return jfu.ravel_pytree(terms.vf(t, unravel(x), full))[0]
 
-    inner = lambda columns: jnp.linalg.solve(kept.T @ T, kept.T @ columns)
-    along = lambda column: jax.jvp(lambda x: field(x, given), (x,), (column,))[1]
-    matrix = inner(jax.vmap(along, 1, 1)(T))
-    if not jtu.tree_leaves(given):
-        return matrix, given, T
-    flat = lambda leaf: inner(leaf.reshape(x.size, -1)).reshape(d, *leaf.shape[1:])
-    return matrix, jtu.tree_map(flat, jax.jacfwd(lambda given: field(x, given))(given)), T
+    # Along tangent vectors and parameters at once, so that the field is compiled once.
+    d, m = kept.shape[1], a.size
+    along = lambda dx, da: jax.jvp(field, (x, a), (dx, da))[1]
+    every = jnp.pad(T, ((0, 0), (0, m))), jnp.eye(m, d + m, d, dtype=a.dtype)
+    slopes = jnp.linalg.solve(kept.T @ T, kept.T @ jax.vmap(along, 1, 1)(*every))
+    by_args = jax.vmap(unravel_args)(slopes[:, d:])
+    return slopes[:, :d], by_args, T
 
 
 def _basis(G: Float[Array, "m n"], redundant: bool) -> Float[Array, "n d"]:

@@ -87,11 +87,15 @@ def _in_drawing(assembly: Any) -> LoopClosure:
 
 def _weighted(bodies: Bodies, J: np.ndarray) -> np.ndarray:
     """Return `J L` with `L L^T = M^-1`; as if bodies without mass had one of 1 kg."""
-    bodies = bodies.with_masses()
-    mass = bodies.mass_matrix(bodies.drawing, bodies.inverse_inertia())
+    mass = _mass_in_drawing(bodies.with_masses())
     if bodies.planar:
         return J / np.sqrt(np.asarray(mass))
     lower = np.linalg.cholesky(np.asarray(mass.inverse))
     number, size, _ = lower.shape
     rows = J.reshape(J.shape[0], number, size)
     return np.einsum("rbi,bij->rbj", rows, lower).reshape(J.shape)
+
+
+@eqx.filter_jit  # operation by operation it would be fifty programs
+def _mass_in_drawing(bodies: Bodies) -> Any:
+    return bodies.mass_matrix(bodies.drawing, bodies.inverse_inertia())
