@@ -197,3 +197,8 @@ def test_a_constraint_of_no_equations_leaves_the_solver_alone(hook):
     np.testing.assert_allclose(batch.ys[0], plain.ys, atol=1e-15)
     with pytest.raises(ValueError, match=r"empty residual.*mj.diffeqsolve"):
         dfx.diffeqsolve(TURN, hook(dfx.Bosh3(), nothing), 0.0, 1.0, 0.1, START)
+
+
+def test_output_times_are_a_vector():
+    with pytest.raises(ValueError, match="`saveat.ts` must be a vector"):
+        solve(saveat=dfx.SaveAt(ts=jnp.array([[0.1, 0.2]])))

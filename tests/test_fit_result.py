@@ -3,11 +3,13 @@
 import re
 import tracemalloc
 
+import diffrax as dfx
 import fit_cases
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.optimize
 import scipy.stats
 from fit_cases import fit_circle, noisy, positions, START, TRUTH, TS, TURN, Y0
 
@@ -143,6 +145,28 @@ def test_a_parameter_near_its_bound_is_inside(lower):
     )
 
 
+@pytest.mark.parametrize("inside", [8e-6, -1e-5, -5e-3])
+def test_a_bound_beside_the_minimum(inside):
+    """One that is hardly active, or not quite: the other parameter has to move with the one at the bound."""
+    ts = np.linspace(0.1, 4, 15)
+    data = 2.0 * np.exp(-0.5 * ts) + 0.05 * np.random.default_rng(0).normal(size=15)
+    given = (
+        dfx.ODETerm(lambda t, y, p: -p["k"] * y),
+        {"k": 0.9, "A": 1.5},
+        jnp.asarray(ts),
+        jnp.asarray(data),
+    )
+    options = dict(y0=lambda p: p["A"], t0=0.0, sigma=0.05)
+    free = mj.fit(*given, **options).parameters["k"]
+    lower = float(free) - inside
+    result = mj.fit(*given, **options, bounds=({"k": lower, "A": 0.0}, {"k": 3.0, "A": 5.0}))
+    residual = lambda p: (p[1] * np.exp(-p[0] * ts) - data) / 0.05
+    bounds, tight = ([lower, 0], [3, 5]), dict(xtol=1e-14, ftol=1e-14, gtol=1e-14)
+    found = scipy.optimize.least_squares(residual, [0.9, 1.5], bounds=bounds, **tight)
+    assert result.at_bounds == (("k",) if inside < 0 else ())
+    np.testing.assert_allclose([result.parameters["k"], result.parameters["A"]], found.x, rtol=2e-6)
+
+
 def test_all_parameters_at_bounds():
     bounds = ({"rate": 1.0, "radius": 2.1}, {"rate": 1.4, "radius": 3.0})
     result = fit_circle(DATA, bounds=bounds, sigma=SIGMA)
@@ -152,10 +176,10 @@ def test_all_parameters_at_bounds():
 
 
 def test_a_parameter_put_on_its_bound_too_early_comes_off_again(monkeypatch):
+    free = fit_circle(DATA, sigma=SIGMA)
     monkeypatch.setattr(optimize, "flat", lambda losses: True)
     monkeypatch.setattr(optimize, "driven", lambda *_: np.array([-1, 0]))
     result = radius_from(1.95)
-    free = fit_circle(DATA, sigma=SIGMA)
     assert result.at_bounds == ()
     np.testing.assert_allclose(result.parameters["radius"], free.parameters["radius"], rtol=1e-6)
 

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.linalg
 from hypothesis import given, settings, strategies as st
 
 import manifold_jax as mj
@@ -210,10 +211,33 @@ def test_failure_raises(residual, message):
 
 
 def test_an_equation_that_ignores_the_state_among_redundant_ones():
-    """Its scaled residual overflows, and the rank of redundant equations is not asked for."""
+    """It cannot hold, and the rank of redundant equations is not asked for."""
     g = mj.Constraint(lambda t, y, args: jnp.stack([y[0] - 1, 0 * y[1] + 5]), redundant=True)
-    with pytest.raises(RuntimeError, match="ignores y"):
+    with pytest.raises(RuntimeError, match="no nearby state satisfies"):
         mj.consistent_state(g, 0.0, jnp.array([1.0, 0.4]))
+
+
+@pytest.mark.parametrize("dt0", [None, 0.1])
+def test_redundant_equations_that_hold_identically(dt0):
+    """The diagonal of `S^T J S = J` is `0 = 0` up to rounding: no direction, and no violation either."""
+    J = np.kron(np.array([[0.0, 1.0], [-1.0, 0.0]]), np.eye(2))
+    H = J @ np.array(
+        [[1.0, 0.2, 0.1, 0.0], [0.2, 2.0, 0.0, 0.3], [0.1, 0.0, 0.5, 0.1], [0.0, 0.3, 0.1, 1.0]]
+    )
+    constraint = mj.Constraint(lambda t, S, args: S.T @ J @ S - J, redundant=True)
+    adaptive = dfx.PIDController(rtol=1e-9, atol=1e-9)
+    sol = mj.diffeqsolve(
+        dfx.ODETerm(lambda t, S, args: H @ S),
+        mj.Projected(dfx.Tsit5(), constraint),
+        0.0,
+        1.0,
+        dt0,
+        jnp.eye(4),
+        stepsize_controller=adaptive if dt0 is None else dfx.ConstantStepSize(),
+    )
+    S = sol.ys[-1]
+    assert jnp.abs(S.T @ J @ S - J).max() < 2e-15
+    np.testing.assert_allclose(S, scipy.linalg.expm(H), atol=1e-7 if dt0 is None else 1e-4)
 
 
 @pytest.mark.parametrize("distance", [1e-14, 1e-12])

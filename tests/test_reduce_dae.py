@@ -226,6 +226,22 @@ def test_no_freedom_is_left_to_a_crane():
     np.testing.assert_allclose(xdot, expected[1], rtol=0, atol=1e-10)
 
 
+def test_a_motion_that_is_prescribed():
+    """Without states: everything is known at each time."""
+
+    def driven(t, x, xdot, args):
+        return xdot["p"] - x["v"], x["p"] - jnp.sin(t), x["f"] - xdot["v"]
+
+    guess = {"p": jnp.array(0.0), "v": jnp.array(1.0), "f": jnp.array(0.0)}
+    dae = mj.reduce_dae(driven, guess)
+    z0, _ = dae.consistent_state(0.0, guess)
+    assert z0.size == 0
+    ts = jnp.linspace(0.0, 2.0, 5)
+    x, _ = dae.outputs(ts, jnp.zeros((5, 0)))
+    for name, exact in (("p", jnp.sin), ("v", jnp.cos), ("f", lambda t: -jnp.sin(t))):
+        np.testing.assert_allclose(x[name], exact(ts), atol=1e-14)
+
+
 @pytest.mark.slow
 def test_servo():
     """A path for the tip, and the torques that follow from it."""
@@ -554,6 +570,11 @@ def test_derivatives_that_do_not_exist():
         mj.reduce_dae(lambda t, x, xdot, args: xdot - square(x), jnp.ones(2))
     with pytest.raises(ValueError, match="not finite near `x_example`"):
         mj.reduce_dae(lambda t, x, xdot, args: jnp.sqrt(-1 - x**2) * xdot, jnp.ones(2))
+
+
+def test_no_unknowns():
+    with pytest.raises(ValueError, match="`x_example` has no numbers"):
+        mj.reduce_dae(lambda t, x, xdot, args: x, jnp.zeros(0))
 
 
 def test_not_under_jit():

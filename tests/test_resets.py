@@ -315,6 +315,48 @@ def test_known_times():
         np.testing.assert_allclose(of_times, exact[1], atol=1e-8)
 
 
+def test_no_times():
+    """A patient without doses."""
+    jump = lambda t, y, args: y + 1
+    none = (mj.ResetAt([], jump), mj.ResetAt(lambda args: jnp.zeros(0), jump))
+    sol = solve_decay(none)
+    assert sol.resets.number == 0
+    np.testing.assert_allclose(sol.ys[-1], np.exp(-1.0), rtol=1e-6)
+
+
+@pytest.mark.parametrize("direction", [1, -1])
+@pytest.mark.parametrize(
+    ("controller", "dt0"),
+    [
+        (dfx.ConstantStepSize(), 0.125),  # steps end at the times
+        (dfx.ConstantStepSize(), 0.1),  # and a few units of rounding beside them
+        (dfx.PIDController(rtol=1e-3, atol=1e-3), None),
+    ],
+)
+def test_known_times_at_the_ends_of_steps(controller, dt0, direction):
+    """What is saved then is the value after the jump, also where a step would have ended there."""
+    ts = direction * jnp.arange(0.0, 5.1, 0.5)
+    jump = mj.ResetAt(direction * jnp.array([1.0, 2.0, 3.0]), lambda t, y, args: y + 1.0)
+    sol = mj.diffeqsolve(
+        dfx.ODETerm(lambda t, y, args: jnp.zeros_like(y)),
+        dfx.Tsit5(),
+        0.0,
+        direction * 5.0,
+        None if dt0 is None else direction * dt0,
+        jnp.zeros(()),
+        saveat=dfx.SaveAt(ts=ts, dense=True),
+        stepsize_controller=controller,
+        resets=(jump,),
+    )
+    assert sol.ys.tolist() == [0, 0, 1, 1, 2, 2, 3, 3, 3, 3, 3]
+    assert (direction * sol.resets.times[:3]).tolist() == [1, 2, 3]
+    sides = [
+        [float(sol.evaluate(direction * t, left=left)) for left in (True, False)]
+        for t in (1.0, 2.0)
+    ]
+    assert sides == [[0, 1], [1, 2]]
+
+
 def cradle(masses, t1, restitution=1.0):
     """Balls on threads in a row, in contact where they hang; the first is let go."""
     n = masses.size
@@ -581,6 +623,7 @@ CONDITION = lambda t, y, args: y[0] - 0.5
         (lambda: mj.Reset(CONDITION, bounced, max_number=0), ValueError, "`max_number` must be"),
         (lambda: mj.ResetAt("noon", bounced), TypeError, "`times` must be a vector"),
         (lambda: mj.ResetAt(jnp.ones((2, 2)), bounced), TypeError, "`times` must be a vector"),
+        (lambda: mj.ResetAt([1.0, np.nan], bounced), ValueError, "`times` has NaN"),
         (lambda: solve_decay(5), TypeError, "`resets` must be a tuple"),
         (lambda: solve_decay((bounced,)), TypeError, "one with a function"),
         (

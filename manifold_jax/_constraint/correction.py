@@ -134,7 +134,9 @@ class CorrectionEquations(AbstractEquations):
     def scaled_residual(self, normals: ConstraintNormals) -> FloatScalar:
         """Return the largest component of the residual, relative to its typical size: to leading
         order the distance from the manifold as a fraction of the size of the state."""
-        return jnp.max(jnp.abs(self.residual(self.x)) / row_scale(normals.jacobian, self.x))
+        return jnp.max(
+            jnp.abs(self.residual(self.x)) / row_scale(normals.jacobian, self.x, self.redundant)
+        )
 
     def starting_at(self, x: Float[Array, " n"]) -> "CorrectionEquations":
         return dataclasses.replace(self, x=x)
@@ -184,7 +186,7 @@ def _correct_once(
     if factored is None:
         factored = equations.factored()
     (G, directions), factorization = factored
-    scale = row_scale(G, equations.x)
+    scale = row_scale(G, equations.x, equations.redundant)
     r = equations.residual(equations.x)
     z = -factorization.solve(r)
     p = equations.x + combine(z, directions)
@@ -211,7 +213,11 @@ def _solve(
         factored = equations.factored()
     (G, directions), factorization = factored
     r = equations.residual(equations.x)
-    fixed, scale, z = equations.along(directions), row_scale(G, equations.x), jnp.zeros_like(r)
+    fixed, scale, z = (
+        equations.along(directions),
+        row_scale(G, equations.x, equations.redundant),
+        jnp.zeros_like(r),
+    )
     if far:
         root = damped_newton(fixed, z, r, scale, max_steps, tolerance)
     else:

@@ -29,7 +29,7 @@ def jacobian(
     return r, rows
 
 
-def row_scale(G: Rows, x: Float[Array, " n"]) -> Float[Array, " m"]:
+def row_scale(G: Rows, x: Float[Array, " n"], redundant: bool = False) -> Float[Array, " m"]:
     """Return the typical size of each residual, `max_j |G_ij| (|x_j| + 1)`.
 
     This is row equilibration (Sudarsan & Keerthi 1998, eqs. (3.3)-(3.4), with the typical sizes taken
@@ -41,6 +41,9 @@ def row_scale(G: Rows, x: Float[Array, " n"]) -> Float[Array, " m"]:
         scale = G.sizes(jnp.abs(x) + 1)
     else:
         scale = jnp.max(jnp.abs(G) * (jnp.abs(x) + 1)[None, :], axis=1)
+    if redundant:
+        largest = jnp.max(scale)
+        scale = jnp.where(scale <= 100 * jnp.finfo(scale.dtype).eps * largest, largest, scale)
     return jnp.maximum(scale, jnp.finfo(scale.dtype).tiny)
 
 

@@ -87,6 +87,8 @@ class ResidualEquations(eqx.Module):
         check_state(x, "x_example")
         x = jtu.tree_map(jnp.asarray, x)
         leaves, structure = jtu.tree_flatten(x)
+        if sum(leaf.size for leaf in leaves) == 0:
+            raise ValueError("`x_example` has no numbers: there is nothing to solve for.")
         shapes = tuple(jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) for leaf in leaves), structure
         t = jnp.zeros((), jnp.result_type(*leaves))
         residual = eqx.filter_eval_shape(function, t, *[x] * (order + 1), args)

@@ -1,5 +1,6 @@
 """The reduced system that users get: a vector field on a manifold."""
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -171,5 +172,6 @@ def _outputs(system: Reduced, t: Any, z: Array, args: Args) -> tuple[Any, ...]:
     axes = jnp.shape(z)[:-1]
     if axes == ():
         return at(t, z)
-    several = jax.vmap(at)(jnp.broadcast_to(t, axes).reshape(-1), z.reshape(-1, z.shape[-1]))
+    number = math.prod(axes)  # of a system without states, too
+    several = jax.vmap(at)(jnp.broadcast_to(t, axes).reshape(-1), z.reshape(number, z.shape[-1]))
     return jax.tree_util.tree_map(lambda x: x.reshape(*axes, *x.shape[1:]), several)

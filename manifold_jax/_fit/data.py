@@ -55,7 +55,7 @@ def check_times(ts: Any) -> None:
     ts = np.asarray(ts)
     if ts.ndim not in (1, 2) or ts.shape[-1] < 2 or ts.shape[0] == 0:
         raise ValueError(
-            "`ts` must have shape (times,) for one trajectory, or (records, times) for many "
+            "`ts` must have shape (times,) for one trajectory, or (records, times) for many, two times or more "
             f"(repeat a common grid with `jnp.tile(ts, (records, 1))`), got {ts.shape}."
         )
     if not np.all(np.isfinite(ts)) or not np.all(np.diff(ts, axis=-1) > 0):

@@ -68,15 +68,17 @@ def _within_bounds(objective: Objective, u: Any, options: Options) -> OptimizerO
     again, if it belongs inside after the others have moved."""
     transform = objective.transform
     losses, movable = [], np.ones(transform.start.size, bool)
-    returning = movable.copy()
+    returning, before = movable.copy(), None
     while True:
         found = _with_optimistix(objective, u, options, losses, movable)
+        # On the bound the loss may be larger until the others have moved.
+        if before is not None and not found.loss <= before.loss:
+            u, before = before.u, None
+            continue
         side = driven(found.u, found.solved, objective) * movable
         if np.any(side):
             movable &= side == 0
-            there = put_on_bounds(found.u, side)
-            loss, _ = look(there, objective, options)
-            u = there if float(loss) <= losses[-1] else found.u
+            u, before = put_on_bounds(found.u, side), found
             continue
         side = on_bounds(found.u, transform)
         if not found.success or not np.any(side):

@@ -12,7 +12,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Inexact
+from jaxtyping import Array, Bool, Float, Inexact
 
 from .._base.derivative_rule import ForwardRule
 from .._base.types import BoolScalar, FloatScalar
@@ -168,10 +168,18 @@ def pseudo_invert(A: Float[Array, "m m"], dependent: Any = DEPENDENCE_THRESHOLD)
     matrix is finite, whatever its rank."""
     finite = jnp.all(jnp.isfinite(A))
     A = jnp.where(finite, A, jnp.eye(A.shape[0], dtype=A.dtype))
-    size = _size(jax.lax.stop_gradient(A))
+    fixed = jax.lax.stop_gradient(A)
+    size = jnp.where(_is_rounding(diagonal_of(fixed)), 0, _size(fixed))
     scale = size[:, None] * size[None, :]
     dependent = jax.lax.stop_gradient(jnp.asarray(dependent, A.dtype))
     return Inverse(scale * _pseudo_inverse(scale * A, dependent), finite, jnp.matmul)
+
+
+def _is_rounding(squares: Float[Array, " m"]) -> Bool[Array, " m"]:
+    """Whether squares of lengths of gradients are those of equations that hold identically, `0 = 0` up to rounding,
+    such as the diagonal of `S^T J S = J`."""
+    rounding = 100 * jnp.finfo(squares.dtype).eps
+    return jnp.abs(squares) <= rounding**2 * jnp.max(jnp.abs(squares))
 
 
 @ForwardRule

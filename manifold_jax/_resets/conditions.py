@@ -81,7 +81,7 @@ class Conditions(eqx.Module):
 
         def of(reset: Reset | ResetAt, boolean: bool) -> Any:
             if isinstance(reset, ResetAt):
-                times = reset.times.astype(t.dtype)
+                times = jnp.append(reset.times.astype(t.dtype), jnp.inf)  # there may be none
                 nearest = jnp.argmin(jnp.abs(jax.lax.stop_gradient(times - t)))
                 return lambda t, y: t - times[nearest]
             if boolean:

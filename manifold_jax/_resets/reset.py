@@ -4,6 +4,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import equinox as eqx
+import jax.core
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
@@ -110,6 +111,10 @@ def _vector(times: Any) -> Array:
     if array.ndim != 1 or array.dtype == bool or jnp.iscomplexobj(array):
         raise TypeError(
             f"`times` must be a vector of numbers, or a function of `args` that returns one, got {_described(times)}."
+        )
+    if not isinstance(array, jax.core.Tracer) and np.isnan(np.asarray(array)).any():
+        raise ValueError(
+            "`times` has NaN, which is no time. Leave it out, or write infinity for a jump that is not made."
         )
     return array if jnp.issubdtype(array.dtype, jnp.floating) else array.astype(float)
 

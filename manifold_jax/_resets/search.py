@@ -197,8 +197,9 @@ class EventSearch(NamedTuple):
         noise = noise / jnp.maximum(rate, 1e3 * noise + jnp.finfo(rate.dtype).tiny)
         noise = jnp.where(self.is_boolean, 1e-12, noise)
         tolerance = 16 * rounding + jnp.abs(step.length) * noise
-        tolerance = jnp.where(self.is_known, 4 * rounding, tolerance)
-        return jnp.abs(roots - step.t1) <= tolerance
+        # At a known time the value is the one after the jump: a step that ends there is made again.
+        exactly = step.t1 == _end_of_step(roots, step.t0)
+        return jnp.where(self.is_known, exactly, jnp.abs(roots - step.t1) <= tolerance)
 
     def _is_irregular(self, samples: SampledConditions, near: Array, touching: Array) -> Array:
         """Return which events have no derivative: more than one at a time, or zeros with almost no slope."""
@@ -228,7 +229,7 @@ class EventSearch(NamedTuple):
         # Those at the same time are all that are at the end of the step, or all at its start.
         same = jnp.where(is_at_end, near, roots == earliest)
         number = jnp.argmax(same & happens).astype(jnp.int32)
-        target = jnp.maximum(_before(earliest), _after(step.t0))
+        target = _end_of_step(earliest, step.t0)
         at_start = EventAtStart(
             at_once[number], number, irregular[number], crosses=jnp.asarray(False)
         )
@@ -273,7 +274,12 @@ def _with_signs(tree: Any) -> Any:
     return jtu.tree_map(signed, tree)
 
 
-def _before(t: FloatScalar) -> FloatScalar:
+def _end_of_step(event: Array, t0: FloatScalar) -> Array:
+    """Return where a step from `t0` has to end for an event just after it."""
+    return jnp.maximum(_before(event), _after(t0))
+
+
+def _before(t: Array) -> Array:
     return jnp.nextafter(t, jnp.asarray(-jnp.inf, t.dtype))
 
 

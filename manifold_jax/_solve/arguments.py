@@ -8,6 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
+import numpy as np
 
 from .._adjoint.events import EVENT_KEYWORDS
 from .._base.compat import save_y
@@ -56,6 +57,10 @@ def check_arguments(
     for sub in jtu.tree_leaves(saveat.subs, is_leaf=lambda x: isinstance(x, dfx.SubSaveAt)):
         if sub.fn is not save_y:
             check_function("saveat.fn", sub.fn, "fn(t, y, args)")
+        if sub.ts is not None and np.ndim(sub.ts) != 1:
+            raise ValueError(
+                f"`saveat.ts` must be a vector of times, got shape {np.shape(sub.ts)}."
+            )
     if dt0 is None and isinstance(stepsize_controller, dfx.ConstantStepSize):
         raise ValueError(
             "`dt0` is None, but the size of the steps is constant: give it, or let "
