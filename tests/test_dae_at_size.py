@@ -14,6 +14,8 @@ import manifold_jax as mj
 from manifold_jax._dae import occurrence
 from manifold_jax._dae.equations import ResidualEquations
 from manifold_jax._linalg.condition import reciprocal_condition
+from manifold_jax._linalg.sparse import factorize_sparse, SparseMatrix, SquarePattern
+from manifold_jax._linalg.sparse.condensation import Condensation, Condensed
 
 
 def mesh(t, x, xdot, args):
@@ -186,3 +188,49 @@ def test_singular_matrices(n):
     # Rounding in the place of a zero.
     cancelled = sp.csr_array(np.array([[1.0, 1.0, 0.0], [0.0, 1e-15, 1.0], [0.0, 0.0, 1.0]]))
     assert reciprocal_condition(cancelled) == 0
+
+
+# Unknowns that are eliminated before KLU
+
+
+def with_rates(n, seed):
+    """A matrix of `n` unknowns, of which the first half have equations for one other each, in some order."""
+    random, half = np.random.default_rng(seed), n // 2
+    A = sp.lil_array((n, n))
+    for p in range(half):
+        A[p, p], A[p, random.integers(half, n)] = random.normal(size=2) + 2
+    rest = sp.random_array((n - half, n), density=3 / n, rng=random).toarray()
+    A[half:] = rest + np.eye(n)[half:] * (3 + random.normal(size=n - half))[:, None]
+    order = random.permutation(n)
+    return sp.csr_matrix(A.toarray()[np.ix_(order, order)])
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_elimination_of_rates(seed):
+    A, b = with_rates(160, seed), jnp.asarray(np.random.default_rng(1).normal(size=160))
+    pattern = SquarePattern(A)
+    assert len(Condensation.of(pattern).eliminated) >= 70
+    matrix = SparseMatrix(jnp.asarray(A.toarray()[pattern.rows, pattern.columns]), pattern)
+    factors = jax.jit(lambda matrix: factorize_sparse(matrix, "klu"))(matrix)
+    assert factors.usable
+    assert isinstance(factors.factors.factors.first, Condensed)
+    assert factors.factors.factors.use_first
+    np.testing.assert_allclose(factors.solve(b), np.linalg.solve(A.toarray(), b), rtol=1e-9)
+    through = jax.vjp(factors.solve, b)[1](b)[0]
+    np.testing.assert_allclose(through, np.linalg.solve(A.toarray().T, b), rtol=1e-9)
+
+
+def test_rates_without_a_pivot():
+    """An equation whose own unknown has a coefficient of zero: then KLU takes the whole matrix."""
+    A = with_rates(160, 0)
+    pattern = SquarePattern(A)
+    row = Condensation.of(pattern).eliminated[0]
+    dense = A.toarray()
+    entries = jnp.asarray(dense[pattern.rows, pattern.columns])
+    entries = jnp.where((pattern.rows == row) & (pattern.columns == row), 0, entries)
+    dense[row, row] = 0
+    factors = factorize_sparse(SparseMatrix(entries, pattern), "klu")
+    assert factors.usable
+    assert not factors.factors.factors.use_first
+    b = jnp.asarray(np.random.default_rng(1).normal(size=160))
+    np.testing.assert_allclose(factors.solve(b), np.linalg.solve(dense, b), rtol=1e-9)

@@ -13,6 +13,7 @@ from jaxtyping import Array, Float
 from ..._base.klu import klujax
 from ..._base.types import BoolScalar, FloatScalar
 from ..dense import Factorization
+from .condensation import Condensation, Condensed
 from .elimination import Blocks, eliminate
 from .factorization import solve_in_blocks
 from .multi_elimination import MultiElimination
@@ -39,11 +40,18 @@ def factorize_sparse(A: SparseMatrix, method: Method) -> Factorization:
 
 def _factored(A: SparseMatrix, method: Method) -> tuple[Any, FloatScalar]:
     """Return factors and the error of the known solution."""
-    factors = _FACTORS[method](A)
-    if method in ("tridiagonal", "klu"):
+    if method == "tridiagonal":
+        factors = TridiagonalElimination.of(A)
         return factors, _error(A, factors)
-    error, few = _error(A, factors), float(jnp.finfo(A.entries.dtype).eps) ** (2 / 3)
-    factors = dataclasses.replace(factors, num_solves=jnp.where(error <= few, 1, 2))
+    if method == "klu":
+        factors = _condensed(A)
+        if isinstance(factors, KLU):
+            return factors, _error(A, factors)
+        error = _error(A, factors)
+    else:
+        factors = MultiElimination.of(A)
+        error, few = _error(A, factors), float(jnp.finfo(A.entries.dtype).eps) ** (2 / 3)
+        factors = dataclasses.replace(factors, num_solves=jnp.where(error <= few, 1, 2))
     if method == "multi-elimination":
         return factors, error
     first, second = error <= _tolerance(A), KLU.of(A)
@@ -119,10 +127,15 @@ class KLU(eqx.Module):
         return jnp.where(error <= tolerance * size, x, jnp.nan)
 
 
+def _condensed(A: SparseMatrix) -> "Condensed | KLU":
+    """Return the factors of what is left when unknowns have been eliminated, as often as there are some."""
+    return KLU.of(A) if Condensation.of(A.pattern) is None else Condensed.of(A, _condensed)
+
+
 class Either(eqx.Module):
     """The elimination without exchanges of rows where it is usable, else that of KLU."""
 
-    first: MultiElimination
+    first: MultiElimination | Condensed
     second: KLU
     use_first: BoolScalar
 
@@ -163,11 +176,3 @@ class TridiagonalElimination(eqx.Module):
 
     def solve_transposed(self, b: Float[Array, " n"]) -> Float[Array, " n"]:
         return TridiagonalElimination(self.blocks.transposed(), self.pattern).solve(b)
-
-
-_FACTORS = {
-    "tridiagonal": TridiagonalElimination.of,
-    "multi-elimination": MultiElimination.of,
-    "klu": KLU.of,
-    "either": MultiElimination.of,
-}
