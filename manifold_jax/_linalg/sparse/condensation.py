@@ -2,9 +2,8 @@
 
     d x_p + c x_j = b_p    gives    x_p = (b_p - c x_j) / d
 
-`x' = v` is such an equation in an implicit step. KLU, made for circuits, orders rows and columns without
-regard to numbers; for a flow on a grid of 32 x 32 cells, 3008 unknowns and 1984 such equations, it takes
-22 times as long with them as without.
+`x' = v` is such an equation in an implicit step. KLU orders rows and columns by their structure alone; for a
+flow on 41 x 41 cells, 4961 unknowns and 3280 such equations, a step takes twice as long with them as without.
 """
 
 import functools
