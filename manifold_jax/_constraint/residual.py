@@ -43,7 +43,7 @@ def row_scale(G: Rows, x: Float[Array, " n"], redundant: bool = False) -> Float[
         scale = jnp.max(jnp.abs(G) * (jnp.abs(x) + 1)[None, :], axis=1)
     if redundant:
         largest = jnp.max(scale)
-        scale = jnp.where(scale <= 100 * jnp.finfo(scale.dtype).eps * largest, largest, scale)
+        scale = jnp.where(scale <= 16 * jnp.finfo(scale.dtype).eps * largest, largest, scale)
     return jnp.maximum(scale, jnp.finfo(scale.dtype).tiny)
 
 

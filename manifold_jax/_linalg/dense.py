@@ -178,7 +178,7 @@ def pseudo_invert(A: Float[Array, "m m"], dependent: Any = DEPENDENCE_THRESHOLD)
 def _is_rounding(squares: Float[Array, " m"]) -> Bool[Array, " m"]:
     """Whether squares of lengths of gradients are those of equations that hold identically, `0 = 0` up to rounding,
     such as the diagonal of `S^T J S = J`."""
-    rounding = 100 * jnp.finfo(squares.dtype).eps
+    rounding = 16 * jnp.finfo(squares.dtype).eps
     return jnp.abs(squares) <= rounding**2 * jnp.max(jnp.abs(squares))
 
 
