@@ -118,11 +118,12 @@ def test_a_large_mesh(m):
     dae = reduced(m, "index-1")
     assert dae.report.degrees_of_freedom == int(has_capacitor(m * m).sum())
     z = random_state(dae, m, 0.0, ARGS)
-    controller = dfx.PIDController(1e-6, 1e-6)
+    controller = dfx.PIDController(1e-8, 1e-8)
     solver = mj.Rodas5P()
     sol = mj.diffeqsolve(dae.terms, solver, 0.0, 0.1, 1e-3, z, ARGS, stepsize_controller=controller)
     x, xdot = dae.outputs(sol.ts[-1], sol.ys[-1], ARGS)
-    assert np.abs(mesh(sol.ts[-1], x, xdot, ARGS)).max() < 1e-8
+    # The tolerance times the conductances, some tens, of flows between random voltages.
+    assert np.abs(mesh(sol.ts[-1], x, xdot, ARGS)).max() < 1e-6
 
 
 def test_a_long_chain_of_ratios():
