@@ -142,7 +142,8 @@ class Constraint(AbstractConstraint):
     - `redundant`: equations may depend on each other where they all hold, as long as they do not
         contradict each other. The number of independent ones must be the same near the manifold. It
         is decided anew in each correction: a combination of equations, each scaled to a gradient of
-        length one, counts as dependent if its gradient is below a hundredth of the largest.
+        length one, counts as dependent if its gradient is below a hundredth of the largest. One whose gradient is
+        rounding beside the largest (16 units: 4e-15 of it, in single precision 2e-6) counts as `0 = 0`.
         Corrections then cost an eigenvalue decomposition of an `(m, m)` matrix.
     - `structure`: `"sparse"` for many equations of few numbers of the state each, at a cost that
         grows with their number `m`, not with `m^3`: `G W^-1 G^T` is eliminated in blocks, all else

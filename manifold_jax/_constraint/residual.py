@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._base.types import Args, RealScalarLike, ResidualFunction, Y
+from .._linalg.dense import is_rounding
 from .._linalg.rows import AbstractRows, Rows
 
 
@@ -42,8 +43,7 @@ def row_scale(G: Rows, x: Float[Array, " n"], redundant: bool = False) -> Float[
     else:
         scale = jnp.max(jnp.abs(G) * (jnp.abs(x) + 1)[None, :], axis=1)
     if redundant:
-        largest = jnp.max(scale)
-        scale = jnp.where(scale <= 16 * jnp.finfo(scale.dtype).eps * largest, largest, scale)
+        scale = jnp.where(is_rounding(scale), jnp.max(scale), scale)
     return jnp.maximum(scale, jnp.finfo(scale.dtype).tiny)
 
 

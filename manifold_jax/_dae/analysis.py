@@ -71,7 +71,7 @@ class Analysis:
         def entries(t: Array, y: Array, args: Args) -> Array:
             jets = self.jets(y[:states], y[states:] if self.implicit else None, 0)
             derivatives = self.entries.derivatives(self.example.residual, t, jets, args)
-            return self.entries.entries(derivatives)
+            return self.entries.values(derivatives)
 
         return Samples.of(jax.jit(entries), self.entries.places, self.example, self.layout)
 

@@ -56,8 +56,8 @@ class Compressed(NamedTuple):
         along = lambda *rates: jax.jvp(at, (jets,), (rates,))[1]
         return jax.vmap(along)(*seeds).ravel()
 
-    def entries(self, derivatives: Array) -> Array:
-        """Return the entries, row by row, in the order of `places`."""
+    def values(self, derivatives: Array) -> Array:
+        """Return the values of the entries, row by row, in the order of `places`."""
         return pick(derivatives, self.places.data - 1)
 
     def block(self, derivatives: Array, rows: np.ndarray, columns: np.ndarray) -> Array:

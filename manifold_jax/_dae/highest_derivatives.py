@@ -39,7 +39,7 @@ class HighestDerivatives(AbstractEquations):
         analysis, derivatives = self.analysis, self._derivatives(x)
         if analysis.sparsity is None:
             return Eliminated.of(analysis.elimination, analysis.entries, derivatives)
-        matrix = SparseMatrix(analysis.entries.entries(derivatives), analysis.sparsity.pattern)
+        matrix = SparseMatrix(analysis.entries.values(derivatives), analysis.sparsity.pattern)
         return factorize_sparse(matrix, analysis.sparsity.method)
 
     def matrix(self, w: Float[Array, " n"] | None = None) -> Float[Array, "n n"]:

@@ -39,10 +39,10 @@ def equilibrated(matrix: sp.csr_array) -> sp.csr_array:
 def reciprocal_condition(matrix: Any) -> float:
     """Return, of a sparse matrix, the smallest reciprocal condition number of a diagonal block, in the 2-norm (an estimate in
     the 1-norm for large ones): one for a triangular matrix, zero for a singular one."""
-    matrix = equilibrated(matrix)
-    matrix.data[abs(matrix.data) < singular_below(matrix.dtype)] = 0
     if matrix.shape[0] == 0:
         return 1.0
+    matrix = equilibrated(matrix)
+    matrix.data[abs(matrix.data) < singular_below(matrix.dtype)] = 0
     form = BlockTriangular.of(matrix)
     if form is None:
         return 0.0

@@ -169,17 +169,16 @@ def pseudo_invert(A: Float[Array, "m m"], dependent: Any = DEPENDENCE_THRESHOLD)
     finite = jnp.all(jnp.isfinite(A))
     A = jnp.where(finite, A, jnp.eye(A.shape[0], dtype=A.dtype))
     fixed = jax.lax.stop_gradient(A)
-    size = jnp.where(_is_rounding(diagonal_of(fixed)), 0, _size(fixed))
+    size = jnp.where(is_rounding(jnp.sqrt(jnp.abs(diagonal_of(fixed)))), 0, _size(fixed))
     scale = size[:, None] * size[None, :]
     dependent = jax.lax.stop_gradient(jnp.asarray(dependent, A.dtype))
     return Inverse(scale * _pseudo_inverse(scale * A, dependent), finite, jnp.matmul)
 
 
-def _is_rounding(squares: Float[Array, " m"]) -> Bool[Array, " m"]:
-    """Whether squares of lengths of gradients are those of equations that hold identically, `0 = 0` up to rounding,
+def is_rounding(sizes: Float[Array, " m"]) -> Bool[Array, " m"]:
+    """Whether sizes of gradients are rounding beside the largest: those of redundant equations that hold identically,
     such as the diagonal of `S^T J S = J`."""
-    rounding = 16 * jnp.finfo(squares.dtype).eps
-    return jnp.abs(squares) <= rounding**2 * jnp.max(jnp.abs(squares))
+    return sizes <= 16 * jnp.finfo(sizes.dtype).eps * jnp.max(sizes)
 
 
 @ForwardRule

@@ -118,9 +118,8 @@ class Assembly(eqx.Module):
 
         Faster than `redundant=True`, which decomposes a matrix at every stage, and exact whatever the ratio
         of masses. The forces in the joints are then those of one of several possible sets, in which
-        equations that were left out carry none. Those that are kept may depend on each other in other poses:
-        a solve that ends there, although the mechanism can go on, passes with a drawing of such a pose or
-        with `redundant=True`.
+        equations that were left out carry none. Those that are kept may depend on each other in other
+        poses: where a solve ends although the mechanism can go on, take `redundant=True`.
 
         **Raises** `ValueError` if fewer equations are independent in the drawing than nearby (a singular
         pose), and if numbers of the assembly are traced: call it outside of `jit`.
