@@ -7,6 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optimistix as optx
 import pytest
 
 import manifold_jax as mj
@@ -564,3 +565,39 @@ def test_memory_does_not_grow_with_the_states():
     times, state = 3 * 8 * 2**14, 2 * 8  # and whether they were accepted
     assert few < times + 2 * 2 * 128 * state + 50_000
     assert many > times + 2**14 * state
+
+
+@jax.custom_jvp
+def rounded(x):
+    """An error so large that it decides on the sizes of steps, and that is another in forward mode."""
+    return x * (1 + 1e-7 * jnp.sin(1e8 * x))
+
+
+rounded.defjvp(lambda x, dx: (x[0] * (1 + 1e-7 * jnp.sin(1.3e8 * x[0])), dx[0]))
+
+
+def test_forward_mode_repeats_the_steps_that_were_made():
+    """What is saved at the ends of steps, and an event inside of one, is that of the first solve. (Steps of
+    the first solve and of its repetition differ as soon as their errors are as small as rounding; here
+    that is enlarged.)"""
+    controller = dfx.PIDController(rtol=1e-9, atol=1e-9)
+    controller = dfx.ClipStepSizeController(controller, jump_ts=jnp.array([0.31, 0.7]))
+    event = dfx.Event(lambda t, y, args, **_: y - 2.0, optx.Newton(1e-12, 1e-12))
+
+    def values(rate):
+        field = dfx.ODETerm(lambda t, y, args: rate * rounded(y) * jnp.cos(t))
+        saveat = dfx.SaveAt(subs=[dfx.SubSaveAt(steps=True), dfx.SubSaveAt(t1=True)])
+        given = dict(stepsize_controller=controller, saveat=saveat, event=event, max_steps=300)
+        sol = mj.diffeqsolve(field, dfx.Tsit5(), 0.0, 1.5, None, jnp.array(1.0), **given)
+        (times, _), (_, end) = sol.ts, sol.ys
+        last = jnp.argmax(jnp.where(jnp.isfinite(times), times, -1.0))
+        kept = jnp.arange(len(times)) < last
+        return jnp.stack([jnp.sum(jnp.where(kept, sol.ys[0], 0.0)), sol.ts[1][0]]), end
+
+    (steps, time), _ = jax.jit(jax.jacrev(values, has_aux=True))(1.2)
+    forward, end = jax.jit(jax.jacfwd(values, has_aux=True))(1.2)
+    np.testing.assert_allclose(forward, [steps, time], rtol=1e-6)
+    np.testing.assert_allclose(end, 2.0, rtol=1e-12)
+    # y = exp(rate sin t) is 2 at sin t = log(2) / rate.
+    sine = np.log(2) / 1.2
+    np.testing.assert_allclose(time, -sine / 1.2 / np.sqrt(1 - sine**2), rtol=1e-5)

@@ -1,17 +1,21 @@
-"""Forward mode at the steps that were made, as in reverse mode: the ends of steps are held fixed,
-except for the end of the solve."""
+"""Forward mode at the steps that were made, as in reverse mode: their ends are those of the record and
+are held fixed, except for the end of the solve."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import diffrax as dfx
 import equinox as eqx
+import jax
 import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
+from jaxtyping import Array, Bool, Float
 
 from .._base.compat import LoopState, Progress, with_next_time
+from .._base.types import IntScalar
 from .._linalg.newton import without_derivative
-from .._resets.controller import ResettingController
+from .._resets.controller import has_prescribed_times, ResettingController
+from .record import Record
 
 
 class SizesHeldFixed(dfx.AbstractStepSizeController):
@@ -33,21 +37,135 @@ class SizesHeldFixed(dfx.AbstractStepSizeController):
         return keep, ends, next_t1, jump, state, result
 
 
-def with_sizes_held_fixed(
-    controller: dfx.AbstractStepSizeController,
+class MadeSteps(eqx.Module):
+    """The steps of a solve: accepted steps, each after the rejected ones from the same start."""
+
+    starts: Float[Array, " steps"]  # infinite after the last step
+    ends: Float[Array, " steps"]  # negative infinity for rejected steps
+    after_jump: Bool[Array, " steps"]
+
+    @staticmethod
+    def none(record: Record) -> "MadeSteps":
+        """Return what a solve is given that is not a repetition."""
+        steps = record.sizes.blocks * record.sizes.block
+        infinite = jnp.full(steps, jnp.inf, jnp.result_type(record.times))
+        return MadeSteps(infinite, -infinite, jnp.zeros(steps, bool))
+
+    @staticmethod
+    def of(record: Record) -> "MadeSteps":
+        columns = lax.stop_gradient(jnp.asarray(record.times))
+        columns = columns.reshape(-1, columns.shape[-1]).T
+        starts = jnp.where(columns[0] > -jnp.inf, columns[0], jnp.inf)
+        after_jump = columns[2] > 0 if record.jumps else jnp.zeros(len(starts), bool)
+        return MadeSteps(starts, columns[1], after_jump)
+
+    def number_until(self, start: Any) -> IntScalar:
+        """Return how many steps begin at a time or before it."""
+        return jnp.searchsorted(self.starts, start, side="right", method="scan_unrolled")
+
+    def last_from(self, start: Any) -> IntScalar:
+        """Return the last step from a start, the one that may have been accepted."""
+        return self.number_until(start) - 1
+
+
+class Choice(NamedTuple):
+    """What a controller chooses after a step; `none_left` where a solve that is repeated made no more."""
+
+    keep: Bool[Array, ""]
+    start: Float[Array, ""]
+    end: Float[Array, ""]
+    after_jump: Bool[Array, ""]
+    none_left: Bool[Array, ""]
+
+
+@jax.custom_jvp
+def _first_end(own: Any, made: MadeSteps) -> Any:
+    """Return where the first step ends; in forward mode as the record says."""
+    return own
+
+
+@_first_end.defjvp
+def _first_end_made(primals: Any, tangents: Any) -> tuple[Any, Any]:
+    own, made = primals
+    end = made.ends[made.last_from(made.starts[0])]
+    return jnp.where(end > -jnp.inf, end, own), jnp.zeros_like(tangents[0])
+
+
+@jax.custom_jvp
+def _choice(own: Choice, step: tuple[Any, Any], made: MadeSteps) -> Choice:
+    """Return the controller's own choice after a step, but in forward mode, which repeats a solve, that of
+    the record.
+
+    The repeated step is rounded differently. Where errors are as small as rounding, the next one would
+    have quite another size, while values saved at the ends of steps and events in them are those of
+    the first solve.
+    """
+    return own
+
+
+@_choice.defjvp
+def _choice_made(primals: Any, tangents: Any) -> tuple[Choice, Any]:
+    _, (start, end), made = primals
+    until_now = made.number_until(start)
+    first = made.starts[jnp.minimum(until_now, len(made.starts) - 1)]
+    following = made.last_from(first)
+    none_left = (first <= start) | (first == jnp.inf) | (made.ends[following] == -jnp.inf)
+    choice = Choice(
+        made.ends[until_now - 1] > -jnp.inf,
+        jnp.where(none_left, end, first),
+        jnp.where(none_left, end, made.ends[following]),
+        made.after_jump[following] & ~none_left,
+        none_left,
+    )
+    return choice, jtu.tree_map(jnp.zeros_like, tangents[0])
+
+
+class StepsOfRecord(dfx.AbstractStepSizeController):
+    """Wraps a controller; in forward mode the steps are those that were made."""
+
+    controller: SizesHeldFixed
+    made: MadeSteps
+    end: Any  # of the solve
+
+    def wrap(self, direction: Any) -> "StepsOfRecord":
+        return eqx.tree_at(lambda c: c.controller, self, self.controller.wrap(direction))
+
+    def init(self, *args: Any) -> Any:
+        return self.controller.init(*args)
+
+    def adapt_step_size(self, t0, t1, *step: Any) -> Any:
+        keep, start, end, after_jump, state, result = self.controller.adapt_step_size(t0, t1, *step)
+        own = Choice(*map(jnp.asarray, (keep, start, end, after_jump, False)))
+        choice = _choice(without_derivative(own), lax.stop_gradient((t0, t1)), self.made)
+        start = jnp.where(choice.start == t1, t1, choice.start)
+        end = jnp.where(choice.end == self.end, self.end, choice.end)
+        if after_jump is not False:
+            after_jump = choice.after_jump
+        unfinished = choice.none_left & (start < self.end)
+        result = dfx.RESULTS.where(unfinished, dfx.RESULTS.max_steps_reached, result)
+        return choice.keep, start, end, after_jump, state, result
+
+
+def with_steps_held_fixed(
+    controller: dfx.AbstractStepSizeController, made: MadeSteps | None, end: Any
 ) -> dfx.AbstractStepSizeController:
-    """Return a controller whose step sizes have no derivatives; the times of events have."""
+    """Return a controller whose steps have no derivatives, and in forward mode are those that were made
+    where it chose their sizes; the times of resets have derivatives."""
     if isinstance(controller, ResettingController):
-        return eqx.tree_at(
-            lambda c: c.controller, controller, SizesHeldFixed(controller.controller)
-        )
-    return SizesHeldFixed(controller)
+        # These look for the resets again, and end steps where they are found.
+        inside = SizesHeldFixed(controller.controller)
+        return eqx.tree_at(lambda c: c.controller, controller, inside)
+    fixed = SizesHeldFixed(controller)
+    if made is None or has_prescribed_times(controller):
+        return fixed
+    return StepsOfRecord(fixed, made, end)
 
 
-def with_end_held_fixed(state: LoopState, t1: Any) -> LoopState:
+def with_end_held_fixed(state: LoopState, t1: Any, made: MadeSteps | None) -> LoopState:
     """Hold the end of the first step fixed, unless it is the end of the solve."""
-    tnext = Progress.of(state).tnext
-    return with_next_time(state, jnp.where(tnext == t1, t1, lax.stop_gradient(tnext)))
+    tnext = lax.stop_gradient(Progress.of(state).tnext)
+    first = tnext if made is None else _first_end(tnext, made)
+    return with_next_time(state, jnp.where(first == t1, t1, first))
 
 
 def event_of_controller(

@@ -22,7 +22,12 @@ from .._base.compat import (
 from .._base.derivative_rule import apply_linear, ForwardRule
 from .._resets.controller import state_of_resets
 from .events import LocatingAdjoint
-from .fixed_steps import event_of_controller, with_end_held_fixed, with_sizes_held_fixed
+from .fixed_steps import (
+    event_of_controller,
+    MadeSteps,
+    with_end_held_fixed,
+    with_steps_held_fixed,
+)
 from .gradient import Ends, TimesBar, with_zeros
 from .record import Record, recording
 from .replay import outputs_of, Replay, Solve, State, subs_of, with_outputs
@@ -112,10 +117,10 @@ class StepReplayAdjoint(dfx.AbstractAdjoint):
         times = t0, t1, [sub.ts for sub in subs_of(saveat)]
         dt0 = nondifferentiable(dt0, msg=_NO_STEP_SIZES)
 
-        def run(outer_while_loop):
+        def run(outer_while_loop, made):
             return diffrax_loop(
                 solver=_with_loops(solver, "lax"),
-                stepsize_controller=with_sizes_held_fixed(stepsize_controller),
+                stepsize_controller=with_steps_held_fixed(stepsize_controller, made, t1),
                 event=event_of_controller(event, stepsize_controller),
                 saveat=saveat,
                 t0=t0,
@@ -124,7 +129,7 @@ class StepReplayAdjoint(dfx.AbstractAdjoint):
                 max_steps=max_steps,
                 terms=terms,
                 args=args,
-                init_state=with_end_held_fixed(init_state, t1),
+                init_state=with_end_held_fixed(init_state, t1, made),
                 inner_while_loop=_while_loop,
                 outer_while_loop=outer_while_loop,
                 progress_meter=progress_meter,
@@ -137,21 +142,24 @@ class StepReplayAdjoint(dfx.AbstractAdjoint):
         solve = Solve.of(terms, twice, args, init_state, stepsize_controller, memory_is_used)
         start = solve.state(init_state)
         replay = Replay.build(solve, saveat, t0, start, interpolates)
-        record = None
+        record = made = None
         if max_steps is not None:
             room = max(max_steps, 1), self.checkpoints
             kinds = solve.jumps, solve.resetting is not None
             record = Record.empty(start, Progress.of(init_state).tprev.dtype, *room, *kinds)
+            made = MadeSteps.none(record)
 
-        def forward(record):
+        def forward(record, made):
             if record is None:
-                return run(_while_loop), None
-            return recording(record, solve.state, run)
+                return run(_while_loop, None), None
+            return recording(record, solve.state, lambda loop: run(loop, made))
 
         # Closed-over arrays of the functions become leaves, which have derivatives.
-        forward = convert_closure(forward, record)
+        forward = convert_closure(forward, record, made)
         differentiable = replay, start, times, forward
-        (final_state, statistics), outputs, _ = _solve(differentiable, record, solve.remembers)
+        (final_state, statistics), outputs, _ = _solve(
+            differentiable, (record, made), solve.remembers
+        )
         return with_outputs(final_state, outputs), statistics
 
 
@@ -174,10 +182,10 @@ def _while_loop(*args: Any, checkpoints: Any = None, **kwargs: Any) -> Any:
 
 
 @ForwardRule
-def _solve(differentiable, record, remembers):
+def _solve(differentiable, empty, remembers):
     """Return the result of the loop; its differentiable part; the record and the final state."""
     *_, run = differentiable
-    (state, statistics), record = run(record)
+    (state, statistics), record = run(*empty)
     return (state, statistics), outputs_of(state, remembers), (record, state)
 
 
@@ -191,17 +199,23 @@ def _solve_jvp(values, primals, tangents):
     arrays, static = eqx.partition((differentiable, empty, values), eqx.is_array)
 
     def forward(arrays, tangents):
-        differentiable, empty, _ = eqx.combine(arrays, static)
+        differentiable, (empty, made), values = eqx.combine(arrays, static)
+        *_, (record, _) = values
+        if record is not None:
+            made = MadeSteps.of(record)
         each = iter(tangents)
         tangents = [None if dx is None else next(each) for dx in leaves_in]
         *_, run_tangent = jtu.tree_unflatten(structure, tangents)
 
-        def final(run):
-            (state, _), record = run(empty)
+        def final(run, made):
+            (state, _), record = run(empty, made)
             values = outputs_of(state, remembers), (record, state)
             return eqx.filter(values, eqx.is_inexact_array)
 
-        tangents_out = eqx.filter_jvp(final, (differentiable[-1],), (run_tangent,))[1]
+        # That of the steps is not None, so that the rule with which they are made again is applied.
+        primals = differentiable[-1], made
+        along = run_tangent, jtu.tree_map(_zero_tangent, made)
+        tangents_out = eqx.filter_jvp(final, primals, along)[1]
         return nondifferentiable_backward(tangents_out, msg=_FORWARDS_ALONE)
 
     def transpose(arrays, cotangents_out):
@@ -216,6 +230,10 @@ def _solve_jvp(values, primals, tangents):
     given = [dx for dx in leaves_in if dx is not None]
     tangents_out = apply_linear(forward, transpose, outputs_like, arrays, given)
     return jtu.tree_map(lambda _: None, values[0]), *tangents_out
+
+
+def _zero_tangent(x: Any) -> Any:
+    return jnp.zeros_like(x) if eqx.is_inexact_array(x) else None
 
 
 def _gradient(differentiable, is_perturbed, values, cotangents_out):

@@ -61,7 +61,7 @@ class ResettingController(dfx.AbstractStepSizeController):
         stops_before &= aimed
         repeated = aimed & ~stops_before
         resumed = at_event & (state.shortened > 0)
-        if self._has_prescribed_times:
+        if has_prescribed_times(self.controller):
             resumed &= state.shortened_end > time
         following = jnp.where(resumed, self._resumed(state, time, next_t1), next_t1)
         following = jnp.where(at_event, jnp.maximum(following, time), following)
@@ -84,16 +84,12 @@ class ResettingController(dfx.AbstractStepSizeController):
     def _is_clipped(self) -> bool:
         return isinstance(_innermost(self.controller), dfx.ClipStepSizeController)
 
-    @property
-    def _has_prescribed_times(self) -> bool:
-        return isinstance(_innermost(self.controller), dfx.ConstantStepSize | dfx.StepTo)
-
     def _resumed(self, state: ResettingState, time: FloatScalar, suggested: Any) -> FloatScalar:
         """Return the end of the step after an event: as long as the one that was shortened for it, or with
         prescribed times of steps to the same end."""
         if self._is_clipped:
             return suggested
-        if self._has_prescribed_times:
+        if has_prescribed_times(self.controller):
             return state.shortened_end
         return time + state.shortened
 
@@ -116,6 +112,11 @@ def _next_end(
     told = EventAtStart(stops_before, met.number, met.irregular, crosses=jnp.asarray(True))
     told_by = told.end_of_step(t1, met.sides.size)
     return stops_before, jnp.where(stops_before, told_by, target)
+
+
+def has_prescribed_times(controller: Any) -> bool:
+    """Whether the times at which steps end are prescribed, not chosen."""
+    return isinstance(_innermost(controller), dfx.ConstantStepSize | dfx.StepTo)
 
 
 def _innermost(controller: Any) -> Any:
