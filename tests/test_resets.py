@@ -1,6 +1,7 @@
 """Jumps of the state at events and at known times, with the derivative of the time of the event."""
 
 import diffrax as dfx
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -504,6 +505,44 @@ def test_boolean_conditions():
     late = mj.Reset(lambda t, y, args: t > 0.5, lambda t, y, args: y + 1.0)
     end = lambda p: drop(p, 0.7, resets=(late,)).ys[0, 0]
     np.testing.assert_allclose(jax.grad(end)(BALL), [-0.245, 0, 1, 0.7], atol=1e-9)
+
+
+@pytest.mark.parametrize("boolean", [False, True])
+def test_an_event_whose_sign_a_jump_changes_back(boolean):
+    """Falling faster than 3 ends the solve, on the way to a bounce after which the ball rises. A real
+    function has its time and derivative, a Boolean one the end of the step, before the bounce."""
+    speed = lambda t, y, args, **kwargs: y[1] < -3.0 if boolean else y[1] + 3.0
+    finder = None if boolean else optx.Newton(1e-12, 1e-12)
+
+    def stop(p):
+        sol = drop(p, event=dfx.Event(speed, finder, None if boolean else False))
+        return sol.ts[0], sol
+
+    if boolean:
+        _, sol = stop(BALL)
+        np.testing.assert_allclose(sol.ts[0], bounce_times(BALL, 1)[0], rtol=1e-13)
+        assert sol.ys[0, 1] < -3
+    else:
+        (time, sol), slopes = eqx.filter_jit(jax.value_and_grad(stop, has_aux=True))(BALL)
+        exact = lambda p: (3 + p[3]) / p[0]
+        np.testing.assert_allclose(time, exact(BALL), rtol=1e-12)
+        np.testing.assert_allclose(sol.ys[0, 1], -3, rtol=1e-12)
+        np.testing.assert_allclose(slopes, jax.grad(exact)(BALL), rtol=1e-9, atol=1e-12)
+    assert sol.result == dfx.RESULTS.event_occurred
+    assert int(sol.resets.number) == 0
+
+
+def test_a_steady_state_ends_a_solve_with_resets():
+    """Event functions are given the controller of the user, whose tolerances this one asks for."""
+    dose = mj.ResetAt([1.0, 2.0], lambda t, y, args: y + 1.0)
+    event, given = (
+        dfx.Event(dfx.steady_state_event()),
+        dict(stepsize_controller=PID, resets=(dose,)),
+    )
+    decay, y0 = dfx.ODETerm(lambda t, y, args: -y), jnp.ones(1)
+    sol = mj.diffeqsolve(decay, dfx.Tsit5(), 0.0, 100.0, None, y0, event=event, **given)
+    assert sol.result == dfx.RESULTS.event_occurred
+    assert int(sol.resets.number) == 2
 
 
 def test_an_event_ends_a_solve_with_resets():

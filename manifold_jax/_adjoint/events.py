@@ -25,6 +25,7 @@ from .._base.compat import (
 from .._base.types import BoolScalar, FloatScalar, IntScalar, Y
 from .._linalg.newton import root_of_step
 from .._resets.controller import state_of_resets
+from .._resets.terminating import has_happened
 from .._solver.base import AbstractManifoldSolver
 
 
@@ -129,25 +130,16 @@ class _EventsInStep:
 
     def _changed(self) -> Bool[Array, " events"]:
         """Return which events have happened in this step, not only the first in their order."""
-
-        def has(before, after, direction):
-            if after.dtype == bool:
-                return after
-            before, after = jnp.sign(before), jnp.sign(after)
-            if direction is None:
-                return before != after
-            return (before <= 0) & (after > 0) if direction else (before > 0) & (after <= 0)
-
         before = self._values(self.start)
         if self.jump is None:
             each = zip(before, self.after, self.directions, strict=True)
-            return jnp.stack([has(*of) for of in each]) | self.mask
+            return jnp.stack([has_happened(*of) for of in each]) | self.mask
         # Before the jump; a Boolean condition ends the solve after it.
         end = zip(self._values(self.end), self.after, strict=True)
         at_end = self.jump.at_end
         after = [a if a.dtype == bool else jnp.where(at_end, v, a) for v, a in end]
         each = zip(before, after, self.directions, strict=True)
-        return jnp.stack([has(*of) for of in each]) & (self.mask | at_end)
+        return jnp.stack([has_happened(*of) for of in each]) & (self.mask | at_end)
 
     def _root(self, i: IntScalar, changed: BoolScalar) -> tuple[FloatScalar, optx.RESULTS]:
         def value(t, _):  # its root is the end of the step if the event has not happened

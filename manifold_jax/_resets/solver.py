@@ -22,6 +22,7 @@ from .jump import Jump, jump_at_end, vector_field
 from .met import Met, Report
 from .samples import SampledConditions, SearchedStep
 from .search import EventSearch, Found, History
+from .terminating import TerminatingEvents
 
 
 class ResetState(eqx.Module):
@@ -55,6 +56,7 @@ class Resetting(dfx.AbstractWrappedSolver):
 
     inner: dfx.AbstractSolver
     conditions: Conditions
+    terminating: TerminatingEvents | None
     t0: FloatScalar  # of the solve, in the time of Diffrax
     end: FloatScalar
     max_resets: int = eqx.field(static=True)
@@ -119,7 +121,16 @@ class Resetting(dfx.AbstractWrappedSolver):
             return samples, search.may_find(step, samples, history)
 
         samples, may_find = held(sample)
-        find = lambda *given: _first(*self._search(terms, *given), samples)
+
+        def find(*given: Any) -> Found:
+            search, step, history = self._search(terms, *given)
+            found = search.first(step, samples, history)
+            if self.terminating is None:
+                return found
+            # An event before the reset ends the solve.
+            goes_on = ~(found.ends_step & self.terminating.happen_in(step))
+            happens, ends_step = found.happens & goes_on, found.ends_step & goes_on
+            return found._replace(happens=happens, ends_step=ends_step)
 
         def look() -> Met:
             found = held(find)
@@ -220,12 +231,6 @@ class Resetting(dfx.AbstractWrappedSolver):
 
     def func(self, terms, t0: RealScalarLike, y0: Y, args: Args) -> Any:
         return self.inner.func(terms, t0, y0, args)
-
-
-def _first(
-    search: EventSearch, step: SearchedStep, history: History, samples: SampledConditions
-) -> Found:
-    return search.first(step, samples, history)
 
 
 def inner_state(solver_state: Any) -> Any:

@@ -133,7 +133,9 @@ def diffeqsolve(
     solver = _as_in_steps(
         solver, stepsize_controller, bool(resets) or event is not None, consistent, y0
     )
-    setup = Setup(terms, solver, dt0, saveat, stepsize_controller, consistent, throw, event)
+    setup = Setup(
+        terms, solver, dt0, saveat, stepsize_controller, consistent, throw, event, max_steps
+    )
     ready = prepare(setup, ProblemData(t0, t1, y0, args))
     t0, t1, y0, _ = ready.data
     adjoint = CheckedStartAdjoint(adjoint, solver_state is not None, saveat.solver_state)
@@ -142,8 +144,9 @@ def diffeqsolve(
     run = LoopArguments(solver, stepsize_controller, saving(setup), ready.solver_state, y0)
     if solver_state is not None:
         run = run._replace(solver_state=solver_state)
+    event = events_in_true_time(setup, ready)
     if resets:
-        run = with_resets(run, resets, max_resets, setup, ready)
+        run = with_resets(run, resets, max_resets, setup, ready, event)
     sol = dfx.diffeqsolve(
         terms,
         run.solver,
@@ -155,7 +158,7 @@ def diffeqsolve(
         saveat=run.saveat,
         stepsize_controller=run.controller,
         adjoint=adjoint,
-        event=events_in_true_time(setup, ready),
+        event=event,
         max_steps=max_steps,
         throw=False,
         progress_meter=progress_meter,

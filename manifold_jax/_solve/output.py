@@ -67,7 +67,7 @@ def saving(setup: Setup) -> dfx.SaveAt:
 
 
 def events_in_true_time(setup: Setup, ready: Ready) -> dfx.Event | None:
-    """Return the event with functions that get the true time.
+    """Return the event with functions that get the true time and the arguments of the solve.
 
     Diffrax passes negated times to an event function when integrating backwards; with the original
     terms and times it is consistent again. States at the ends of steps are on the manifold.
@@ -75,7 +75,16 @@ def events_in_true_time(setup: Setup, ready: Ready) -> dfx.Event | None:
     event, data = setup.event, ready.data
     if event is None:
         return None
-    known = dict(terms=setup.terms, t0=data.t0, t1=data.t1, dt0=ready.dt0)
+    known = dict(
+        terms=setup.terms,
+        solver=setup.solver,
+        t0=data.t0,
+        t1=data.t1,
+        dt0=ready.dt0,
+        saveat=setup.saveat,
+        stepsize_controller=setup.controller,
+        max_steps=setup.max_steps,
+    )
     direction = data.direction
 
     def wrap(cond_fn: Callable) -> Callable:

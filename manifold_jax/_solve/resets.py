@@ -14,6 +14,7 @@ from .._resets.conditions import Conditions
 from .._resets.controller import ResettingController, ResettingState
 from .._resets.reset import Reset, ResetAt
 from .._resets.solver import ResetState, Resetting
+from .._resets.terminating import TerminatingEvents
 from .finish import finish
 from .prepare import Ready
 from .setup import Setup
@@ -51,8 +52,9 @@ def with_resets(
     max_resets: int,
     setup: Setup,
     ready: Ready,
+    event: dfx.Event | None,
 ) -> LoopArguments:
-    """Return what Diffrax is given for a solve with resets."""
+    """Return what Diffrax is given for a solve with resets, which ends with `event`."""
     t0, t1, _, args = ready.data
     dtype = jnp.result_type(ready.data.direction)
     y0 = jtu.tree_map(jnp.asarray, run.y0)
@@ -62,7 +64,9 @@ def with_resets(
         y0 = eqx.error_if(y0, jnp.any(conditions.true_at_start(t0, y0)), _TRUE_AT_START)
     direction = ready.data.direction
     inner = _with_tolerances(run.solver, run.controller)
-    solver = Resetting(inner, conditions, t0 * direction, t1 * direction, max_resets)
+    terminating = None if event is None else TerminatingEvents(event, args)
+    ends = t0 * direction, t1 * direction
+    solver = Resetting(inner, conditions, terminating, *ends, max_resets)
     state = None if run.solver_state is None else solver.starting(run.solver_state)
     controller = ResettingController(run.controller, max_resets)
     saveat = eqx.tree_at(lambda s: (s.solver_state, s.controller_state), run.saveat, (True, True))

@@ -36,3 +36,4 @@ class Setup(NamedTuple):
     consistent: Consistent
     throw: bool
     event: dfx.Event | None = None
+    max_steps: int | None = None
