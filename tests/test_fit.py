@@ -312,8 +312,12 @@ HOLED = np.where(np.arange(31)[:, None] == 7, np.nan, GOOD)
         (
             dict(data=GOOD[:-1]),
             ValueError,
-            r"`data` must be on the grid `ts`.*\(31, 2\).*\(30, 2\)",
+            r"`data` must be on the grid `ts`.*\(31, 2\).*`y0`.*\(30, 2\)",
         ),
+        (dict(data=GOOD + 1j), ValueError, "`data` must be real numbers, got complex.*z.imag"),
+        (dict(sigma=1j), ValueError, "`sigma` must be a number, or have the structure"),
+        (dict(t0=np.nan), ValueError, "`t0`, the time of the initial state, must be finite"),
+        (dict(t0=np.zeros(2)), ValueError, r"`t0`, .*must be a real number.*shape \(2,\)"),
         (dict(data=(GOOD, GOOD)), ValueError, "`data` must have the structure.*`observe"),
         (
             dict(data=HOLED),
@@ -345,6 +349,7 @@ HOLED = np.where(np.arange(31)[:, None] == 7, np.nan, GOOD)
         ),
         (dict(optimizer=3), TypeError, "`optimizer` must be an Optimistix"),
         (dict(loss=lambda p, d, w: 0.0), ValueError, "`loss` is no sum of squares.*BFGS"),
+        (dict(segments=True), ValueError, "`segments` must be a whole number.*got True"),
         (dict(segments=31), ValueError, "`segments` must be a whole number from 1 to 30"),
         (dict(segments=2, optimizer=optax.adam(0.1)), ValueError, "`segments`.*least-squares"),
         (dict(batch_size=1), ValueError, "`batch_size` needs an Optax optimizer"),

@@ -194,6 +194,63 @@ def test_a_record_that_fails_is_no_sign_of_the_minimum():
     assert offset(J[:1], np.ones(1)) == np.inf
 
 
+def _leak(t, y, p):
+    return p["k"] * (p["c"] - y)
+
+
+def _level_and_other(t, y, p):
+    return {"level": y, "other": p["other"]}
+
+
+@pytest.mark.parametrize(
+    ("unit", "c", "precision"),
+    [
+        pytest.param(1.0, 1e-8, 0.02, id="small start value"),
+        pytest.param(1e-9, 1e-10, 0.02, id="small initial state that is unknown"),
+        pytest.param(1.0, 0.1, 1e-8, id="one quantity far more precise than another"),
+    ],
+)
+def test_standard_errors_do_not_depend_on_units(unit, c, precision):
+    """`other` is measured itself, the initial level is unknown."""
+    ts, noise = np.linspace(0.2, 5, 20), np.random.default_rng(0).normal(size=(2, 20))
+    sigma = {"level": precision * unit, "other": 0.5}
+    level = unit * (0.5 + 2.5 * np.exp(-0.7 * ts)) + sigma["level"] * noise[0]
+    result = mj.fit(
+        dfx.ODETerm(_leak),
+        {"k": 0.5, "c": c, "other": 1.0},
+        ts,
+        {"level": level, "other": 3.0 + sigma["other"] * noise[1]},
+        y0=jnp.asarray(2.5 * unit),
+        fit_initial=True,
+        t0=0.0,
+        observe=_level_and_other,
+        sigma=sigma,
+        stepsize_controller=dfx.PIDController(rtol=1e-10, atol=1e-22),
+    )
+    k, c, decayed = (
+        *(result.parameters[name] for name in "kc"),
+        np.exp(-result.parameters["k"] * ts),
+    )
+    J = np.stack([(c - result.y0) * ts * decayed, 1 - decayed, decayed], axis=1) / sigma["level"]
+    lengths = np.linalg.norm(J, axis=0)
+    expected = np.sqrt(np.diag(np.linalg.inv((J / lengths).T @ (J / lengths)))) / lengths
+    errors = result.standard_errors
+    assert result.unidentifiable == ()
+    assert result.degrees_of_freedom == 40 - 4
+    np.testing.assert_allclose([errors["k"], errors["c"]], expected[:2], rtol=1e-5)
+    np.testing.assert_allclose(errors["other"], 0.5 / np.sqrt(20), rtol=1e-6)
+    np.testing.assert_allclose([k, c / unit], [0.7, 0.5], atol=0.1)
+
+
+def test_a_parameter_that_cancels_but_for_rounding_is_not_determined():
+    swing = lambda t, y, p: jnp.stack([y[1], -p["mass"] * p["g"] * y[0] / p["mass"]])
+    start, truth = {"mass": 3.3, "g": 0.9}, np.stack([np.cos(TS), -np.sin(TS)], axis=1)
+    result = mj.fit(dfx.ODETerm(swing), start, TS, noisy(truth, 0.01), y0=Y0, sigma=0.01)
+    assert result.unidentifiable == ("mass (+1)",)
+    assert np.isinf(result.standard_errors["mass"])
+    assert 0 < result.standard_errors["g"] < 0.01
+
+
 def test_memory_of_standard_errors_grows_with_the_data_only():
     J = np.random.default_rng(0).normal(size=(4000, 3))
     tracemalloc.start()

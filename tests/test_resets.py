@@ -507,6 +507,54 @@ def test_boolean_conditions():
     np.testing.assert_allclose(jax.grad(end)(BALL), [-0.245, 0, 1, 0.7], atol=1e-9)
 
 
+def test_a_ball_comes_to_rest_on_a_moving_table():
+    """Its last hops are smaller than the rounding of its height above the table, which it must not fall
+    through: the solve ends with too many resets. Restitution, height of the table, and its motion."""
+    table = lambda t, p: p[1] + p[2] * jnp.sin(p[3] * t)
+    speed = lambda t, p: p[2] * p[3] * jnp.cos(p[3] * t)
+    bounce = lambda t, y, p: jnp.stack([y[0], (1 + p[0]) * speed(t, p) - p[0] * y[1]])
+    contact = mj.Reset(lambda t, y, p: y[0] - table(t, p), bounce, direction=False)
+    fall = dfx.ODETerm(lambda t, y, p: jnp.stack([y[1], 0.2 * jnp.sin(5 * t) - 9.81]))
+    given = dict(stepsize_controller=PID, resets=(contact,), max_resets=200, throw=False)
+
+    @jax.jit
+    @jax.vmap
+    def rest(p):
+        y0 = jnp.stack([p[1] + 1.0, 0 * p[1]])
+        sol = mj.diffeqsolve(fall, dfx.Tsit5(), 0.0, 2.5, None, y0, p, **given)
+        return sol.ys[0, 0] - table(sol.ts[0], p), sol.result == dfx.RESULTS.max_steps_reached
+
+    heights, slopes = [0.0, 3.0, 100.0], [0.05, 0.3]
+    cases = [(e, z, a, 2.5) for e in (0.1, 0.25, 0.5) for z in heights for a in slopes]
+    gap, stopped = rest(jnp.array(cases))
+    assert stopped.all()
+    np.testing.assert_allclose(gap, 0, atol=1e-12)
+
+
+def test_third_derivative_of_the_time_of_an_event():
+    """That of log(2) / a, when a decay has reached one half."""
+    half = mj.Reset(lambda t, y, a: y - 0.5, lambda t, y, a: y + 0.5, direction=False)
+    given = dict(stepsize_controller=dfx.PIDController(rtol=1e-10, atol=1e-10), resets=(half,))
+    decay = dfx.ODETerm(lambda t, y, a: -a * y)
+
+    def time(a):
+        sol = mj.diffeqsolve(
+            decay,
+            dfx.Dopri8(),
+            0.0,
+            1.0,
+            0.1,
+            jnp.array(1.0),
+            a,
+            adjoint=dfx.ForwardMode(),
+            **given,
+        )
+        return sol.resets.times[0]
+
+    third = jax.jit(jax.jacfwd(jax.jacfwd(jax.jacfwd(time))))(1.3)
+    np.testing.assert_allclose(third, -6 * np.log(2) / 1.3**4, rtol=1e-8)
+
+
 @pytest.mark.parametrize("boolean", [False, True])
 def test_an_event_whose_sign_a_jump_changes_back(boolean):
     """Falling faster than 3 ends the solve, on the way to a bounce after which the ball rises. A real

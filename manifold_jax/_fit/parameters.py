@@ -103,7 +103,11 @@ def _flat_prefix(prefix: Any, tree: Any, name: str, what: str) -> np.ndarray:
 def spread(prefix: Any, tree: Any, advice: str) -> Any:
     """Return numbers like those in `tree`, from a tree whose leaves hold for whole parts of it."""
     fill = lambda value, part: jtu.tree_map(
-        lambda leaf: np.broadcast_to(np.asarray(value, float), np.shape(leaf)), part
+        # With this casting complex numbers raise, and do not lose their imaginary parts.
+        lambda leaf: np.broadcast_to(
+            np.asarray(value).astype(float, casting="same_kind"), np.shape(leaf)
+        ),
+        part,
     )
     try:
         return jtu.tree_map(fill, prefix, tree)

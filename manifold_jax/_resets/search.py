@@ -6,17 +6,13 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import jax.tree_util as jtu
-import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from .._base.types import BoolScalar, FloatScalar, IntScalar, Y
 from .at_start import EventAtStart
 from .bracket import root_in_bracket
 from .samples import BEYOND, SampledConditions, SearchedStep
-
-
-_PERTURBATIONS = 4
+from .sensitivity import Sensitivity
 
 
 class History(eqx.Module):
@@ -84,7 +80,8 @@ class EventSearch(NamedTuple):
 
     def first(self, step: SearchedStep, samples: SampledConditions, history: History) -> Found:
         """Return the first event of a step."""
-        noise, rate = self._sensitivity(step)
+        sensitivity = Sensitivity.of(self.values, self.is_boolean, step)
+        noise, rate = sensitivity.noise, sensitivity.rate
         small = jnp.maximum(4 * noise, 1e3 * jnp.finfo(noise.dtype).eps * history.scale)
         before, start, on_surface = self._start(samples, rate, history, small)
         # A jump changed the sign, or the state leaves the surface on which it began: at once.
@@ -98,6 +95,9 @@ class EventSearch(NamedTuple):
         crossings = self._crosses(signs[:-1], signs[1:])
         place, found = jnp.argmax(crossings, axis=0), jnp.any(crossings, axis=0)
         roots = self._roots(step, samples, place, found & ~at_once, on_surface)
+        hop, is_short = sensitivity.hop(step.length, largest)
+        hops = on_surface & ~at_once & is_short & self._crosses(start, -start)
+        roots = jnp.where(hops, step.t0 + hop, roots)
         roots = jnp.where(self.is_known, self.known_times, roots)
         roots = jnp.where(at_once, step.t0, roots)
         is_far = (roots > step.t1 + BEYOND * step.length) & ~at_once
@@ -105,7 +105,7 @@ class EventSearch(NamedTuple):
         at_end = roots >= self.end - 200 * rounding  # of the solve, where nothing happens any more
         roots = jnp.where(self.ignored | at_end | is_far, jnp.inf, roots)
         near = self._is_at_end(step, samples, roots, noise, rounding) & ~at_once
-        irregular = self._is_irregular(samples, near, at_once & on_surface)
+        irregular = self._is_irregular(samples, near & ~hops, at_once & on_surface)
         # What jumps have caused already, or is at the same time, stays so until its own jump.
         infinite = lambda sign: jnp.where(sign == 0, 0, sign * jnp.inf)
         waiting = jnp.where(leaves, infinite(before), infinite(start))
@@ -141,24 +141,6 @@ class EventSearch(NamedTuple):
         unknown = jnp.isnan(history.sides) | ~history.remembers
         return jnp.where(unknown, 0, before), start, on_surface
 
-    def _sensitivity(self, step: SearchedStep) -> tuple[Float[Array, " resets"], ...]:
-        """Return how much rounding of time and state may change the conditions at the end of the step, and
-        their rates of change at its start, 0 if that may be rounding. Dense output does not see a hop that is
-        short beside the step."""
-        start, end = (step.t0, step.y0), (step.t1, step.y1)
-        motion = jnp.ones_like(step.t0), step.field(*start)
-        tiny = jtu.tree_map(lambda x: 16 * jnp.finfo(x.dtype).eps * x, end)
-        single = jtu.tree_map(lambda x: x[None], motion)
-        parts = _with_signs(tiny), _with_signs(jtu.tree_map(_uncertainty, motion)), single
-        along = jtu.tree_map(lambda *x: jnp.concatenate(x), *parts)
-        n = _PERTURBATIONS
-        at = jtu.tree_map(lambda a, b: jnp.stack([a] * n + [b] * (n + 1)), end, start)
-        changes = jax.vmap(lambda at, along: jax.jvp(self.values, at, along)[1])(at, along)
-        largest = lambda x: jnp.max(jnp.abs(x), axis=0)
-        rate = changes[-1]
-        rate = jnp.where(jnp.abs(rate) <= largest(changes[n : 2 * n]), 0, rate)
-        return jnp.where(self.is_boolean, 0, largest(changes[:n])), rate
-
     def _roots(
         self,
         step: SearchedStep,
@@ -170,16 +152,16 @@ class EventSearch(NamedTuple):
         """Return the times at which conditions change sign between samples `place` and `place + 1`."""
         each = jnp.arange(place.size)
         fractions = jnp.asarray(samples.fractions, step.t0.dtype)
-        # A condition that is zero at the start has another root, that of its value by the time passed.
+        # A condition that is zero at the start has another root, that of its change by the time passed.
         deflated = on_surface & (place == 0)
 
         def value(s: Float[Array, " resets"]) -> Float[Array, " resets"]:
             at = lambda s: self.values(step.t0 + s * step.length, step.path(s))
             values = jax.vmap(at)(s)[each, each]
-            return jnp.where(deflated, values / s, values)
+            return jnp.where(deflated, (values - samples.values[0]) / s, values)
 
         right, end = fractions[place + 1], samples.values[place + 1, each]
-        end = jnp.where(deflated, end / right, end)
+        end = jnp.where(deflated, (end - samples.values[0]) / right, end)
         start = jnp.where(deflated, -end, samples.values[place, each])
         roots = root_in_bracket(value, (fractions[place], start), (right, end), found)
         return jnp.where(found, step.t0 + roots * step.length, jnp.inf)
@@ -255,23 +237,6 @@ def _first_sign(values: Float[Array, "samples resets"], small: Array) -> Float[A
     """Return the sign of the first value of each condition that is larger than rounding, 0 without one."""
     signs = jnp.where(jnp.abs(values) > small[None, :], jnp.sign(values), 0)
     return signs[jnp.argmax(signs != 0, axis=0), jnp.arange(values.shape[1])]
-
-
-def _uncertainty(velocity: Array) -> Array:
-    """Return how large velocities are that may be rounding, also of others that a jump has taken away."""
-    size = jnp.abs(velocity)
-    return 1e-10 * size + 64 * jnp.finfo(velocity.dtype).eps * jnp.max(size, initial=0)
-
-
-def _with_signs(tree: Any) -> Any:
-    """Return several copies of a tree, whose numbers have random signs."""
-    random = np.random.default_rng(0)
-
-    def signed(x: Array) -> Array:
-        signs = random.choice([-1.0, 1.0], (_PERTURBATIONS, *x.shape))
-        return x[None] * jnp.asarray(signs, x.dtype)
-
-    return jtu.tree_map(signed, tree)
 
 
 def _end_of_step(event: Array, t0: FloatScalar) -> Array:
