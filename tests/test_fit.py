@@ -315,7 +315,7 @@ HOLED = np.where(np.arange(31)[:, None] == 7, np.nan, GOOD)
             r"`data` must be on the grid `ts`.*\(31, 2\).*`y0`.*\(30, 2\)",
         ),
         (dict(data=GOOD + 1j), ValueError, "`data` must be real numbers, got complex.*z.imag"),
-        (dict(sigma=1j), ValueError, "`sigma` must be a number, or have the structure"),
+        (dict(sigma=1j * GOOD), ValueError, "`sigma` must be a number, or have the structure"),
         (dict(t0=np.nan), ValueError, "`t0`, the time of the initial state, must be finite"),
         (dict(t0=np.zeros(2)), ValueError, r"`t0`, .*must be a real number.*shape \(2,\)"),
         (dict(data=(GOOD, GOOD)), ValueError, "`data` must have the structure.*`observe"),

@@ -36,7 +36,7 @@ def make_records(
     noise = _flat_sigma(sigma, ts.shape, data, observed)
     if not many:
         ts, values, noise = ts[None], values[None], noise[None]
-    t0 = ts[:, 0] if t0 is None else np.broadcast_to(np.asarray(t0, float), ts[:, 0].shape)
+    t0 = ts[:, 0] if t0 is None else _start_times(t0, ts.shape[0])
     if np.any(t0 > ts[:, 0]):
         raise ValueError(
             f"`t0`, the time of the initial state, must not be after the first of `ts`, "
@@ -49,6 +49,18 @@ def make_records(
         size = np.sqrt(np.sum(values**2) / np.sum(known))
         weights = weights / (size if size > 0 else 1.0)
     return Records(ts, values, weights, t0, many, sigma is not None, observed)
+
+
+def _start_times(t0: Any, records: int) -> np.ndarray:
+    given = np.asarray(t0)
+    if given.dtype.kind not in "iuf" or given.shape not in ((), (records,)):
+        raise ValueError(
+            f"`t0`, the time of the initial state, must be a real number, or one for each of {records} records, "
+            f"got {given.dtype} of shape {given.shape}."
+        )
+    if not np.all(np.isfinite(given)):
+        raise ValueError(f"`t0`, the time of the initial state, must be finite, got {t0}.")
+    return np.broadcast_to(given.astype(float), (records,))
 
 
 def check_times(ts: Any) -> None:
@@ -75,11 +87,17 @@ def flatten(data: Any, lead: tuple[int, ...], observed: Any, name: str) -> np.nd
         )
     flat = []
     for leaf, struct in zip(jtu.tree_leaves(data), jtu.tree_leaves(observed), strict=True):
+        if np.iscomplexobj(leaf):
+            raise ValueError(
+                f"`{name}` must be real numbers, got complex ones. Make the real and the imaginary part components: "
+                "`jnp.stack([z.real, z.imag], axis=-1)`."
+            )
         leaf = np.asarray(leaf, float)
         if leaf.shape != lead + struct.shape:
             raise ValueError(
                 f"`{name}` must be on the grid `ts`, i.e. have the shape {lead + struct.shape} "
-                f"(that of `ts`, then that of one observation), got {leaf.shape}."
+                "(that of `ts`, then that of one observation, which is the state of `y0` unless you pass `observe`), "
+                f"got {leaf.shape}."
             )
         flat.append(leaf.reshape(*lead, -1))
     return np.concatenate(flat, axis=-1)

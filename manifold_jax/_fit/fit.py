@@ -77,7 +77,8 @@ def fit(
         function of the parameters that returns one of these or `(terms, constraint)`, which get
         the parameters as `args`; `terms` alone for an equation without constraints. Define such
         a function once: calls with the same one share compiled code. [`Invariants`][] are frozen anew at the initial state of each solve.
-    - `parameters`: the values to start from, any pytree of real numbers and arrays, `p` in all.
+    - `parameters`: the values to start from, any pytree of real numbers and arrays, `p` in all. Steps are
+        relative to them (absolute from 0): of one that starts many orders of magnitude too small, nothing is seen.
     - `ts`: increasing times of the measurements, shape `(times,)`; or `(records, times)` for
         many trajectories with the same parameters.
     - `data`: the measurements at `ts`, like the state (or what `observe` returns), leaves

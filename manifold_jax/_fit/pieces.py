@@ -25,7 +25,7 @@ def make_pieces(
     A piece ends where the next one begins; the measurement at that time belongs to the next.
     """
     R, T = records.ts.shape
-    if not isinstance(segments, int) or not 1 <= segments < T:
+    if type(segments) is not int or not 1 <= segments < T:
         raise ValueError(
             f"`segments` must be a whole number from 1 to {T - 1} (the intervals of `ts`), "
             f"got {segments!r}."

@@ -12,7 +12,8 @@ from .objective import linearize, Objective, Solved, weighted
 
 
 # Derivatives are as accurate as the solver's tolerance: singular values below this fraction of the
-# largest, after scaling columns to length 1, count as zero.
+# largest, after scaling columns to length 1, count as zero; and so does an effect on a measured
+# quantity below this fraction of the largest effect on it.
 _SINGULAR = 1e-6
 
 
@@ -59,9 +60,13 @@ def _determined(
     determine, and the directions that they do not."""
     linear = jtu.tree_map(np.asarray, linearize(u, solved, objective))
     names, p = np.asarray(objective.transform.names), linear.slopes.size
-    found = gauss_newton(linear.J[used][:, free], linear.C.reshape(-1, u.size)[:, free])
+    large = large_changes(u, objective)
+    linear = linear._replace(J=linear.J * large, C=linear.C * large)
+    moves = free & has_effect(linear, solved.values.observed, objective, used)
+    J, C = (np.where(moves, matrix, 0.0)[..., free] for matrix in (linear.J, linear.C))
+    found = gauss_newton(J[used], np.concatenate([J[used][:0], *C]))
     own = free[:p]
-    slopes, inner = linear.slopes[own], np.count_nonzero(own)
+    slopes, inner = (linear.slopes * large[:p])[own], np.count_nonzero(own)
     block = found.covariance[:inner, :inner] * slopes[:, None] * slopes
     lines = []
     for direction in found.directions:
@@ -72,6 +77,40 @@ def _determined(
     covariance = np.full((p, p), np.nan)
     covariance[np.ix_(own, own)] = block
     return covariance, found.rank, tuple(lines)
+
+
+def large_changes(u: Any, objective: Objective) -> np.ndarray:
+    """Return changes of the unknowns with which their effects can be compared whatever the units and the
+    start values are: for parameters without bounds their start value, or the final one if they have grown,
+    and for tangent coordinates of initial states the size of the states."""
+    transform, pieces = objective.transform, objective.pieces
+    start, theta = np.asarray(transform.start), np.abs(np.asarray(transform.values(u)))
+    bounded = np.isfinite(transform.lower) | np.isfinite(transform.upper)
+    grown = theta / np.where(start == 0, 1.0, np.abs(start))
+    parameters = np.where(bounded | ~np.isfinite(grown), 1.0, np.maximum(grown, 1.0))
+    basis = np.abs(np.asarray(pieces.basis))[np.asarray(objective.free)]
+    sizes = np.max(np.abs(np.asarray(pieces.guess)), axis=0)
+    states = np.max(basis * sizes[:, None], axis=1, initial=0.0).ravel()
+    return np.concatenate([parameters, np.where(states > 0, states, 1.0)])
+
+
+def has_effect(linear: Any, observed: Any, objective: Objective, used: np.ndarray) -> np.ndarray:
+    """Return which unknowns change any prediction or gap by more than the errors of derivatives, `(N,)`.
+
+    Effects are compared for each measured quantity of each piece on its own, without weights: a precise
+    quantity says nothing about what others depend on.
+    """
+    weights = np.where(used, np.asarray(objective.pieces.weights), 1.0)
+    measured = np.where(used[..., None], linear.J / weights[..., None], 0.0)
+    size = np.max(np.abs(np.where(used, np.asarray(observed), 0.0)), axis=1)
+    noticed = lambda effects, rounding: np.any(
+        effects > np.maximum(_SINGULAR * np.max(effects, axis=-1, keepdims=True), rounding),
+        axis=(0, 1),
+    )
+    rounding = 100 * np.finfo(size.dtype).eps * size[..., None]
+    of_data = noticed(np.max(np.abs(measured), axis=1), rounding)
+    # The state where a gap is has an effect of the size of the state, far above rounding.
+    return of_data | noticed(np.abs(linear.C), 0.0)
 
 
 class Uncertainty(NamedTuple):
@@ -93,9 +132,8 @@ def gauss_newton(J: np.ndarray, C: np.ndarray) -> Uncertainty:
     Source: Seber & Wild, Nonlinear Regression (1989), sections 2.1 and 5.13.
     """
     size = np.linalg.norm(np.concatenate([J, C]), axis=0)
-    dead = size <= _SINGULAR * np.max(size, initial=0.0)
-    scale = 1 / np.where(dead, 1.0, size)
-    J, C = np.where(dead, 0.0, J * scale), np.where(dead, 0.0, C * scale)
+    scale = 1 / np.where(size == 0, 1.0, size)
+    J, C = J * scale, C * scale
     Z = scipy.linalg.null_space(C, rcond=1e-12) if C.size else np.eye(J.shape[1])
     # The triangular factor has the same singular values, and the size of the unknowns only.
     _, s, Vt = np.linalg.svd(np.linalg.qr(J @ Z, mode="r"), full_matrices=True)

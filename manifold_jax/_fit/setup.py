@@ -66,14 +66,14 @@ def check_options(options: Options, loss: Any, segments: Any, records: Records) 
         )
     for name in ("steps", "patience", "starts"):
         value = getattr(options, name)
-        if not isinstance(value, int) or value < 1:
+        if type(value) is not int or value < 1:
             raise ValueError(f"`{name}` must be a positive whole number, got {value!r}.")
     size, count = options.batch_size, records.ts.shape[0]
     if size is None:
         return
     if not by_gradient:
         raise ValueError("`batch_size` needs an Optax optimizer: `optimizer=optax.adam(1e-2)`.")
-    if not isinstance(size, int) or not 1 <= size <= count:
+    if type(size) is not int or not 1 <= size <= count:
         raise ValueError(
             f"`batch_size` must be a whole number from 1 to {count}, the number of records (an "
             f"empty batch has nothing to fit), got {size!r}."
