@@ -22,8 +22,8 @@ SYSTEM = mj.MechanicalSystem(
 )
 
 
-def solve(terms=TURN, solver=PROJECTED, dt0=0.1, y0=START, **options):
-    return mj.diffeqsolve(terms, solver, 0.0, 1.0, dt0, y0, **options)
+def solve(terms=TURN, solver=PROJECTED, dt0=0.1, y0=START, t0=0.0, t1=1.0, **options):
+    return mj.diffeqsolve(terms, solver, t0, t1, dt0, y0, **options)
 
 
 @pytest.mark.parametrize(
@@ -42,11 +42,68 @@ def solve(terms=TURN, solver=PROJECTED, dt0=0.1, y0=START, **options):
         (dict(adjoint="backsolve"), "`adjoint`.*'backsolve'.*mj.StepReplayAdjoint"),
         (dict(event=lambda t, y, args, **kwargs: y[0]), r"`event`.*diffrax.Event\(cond_fn\)"),
         (dict(event=dfx.Event(lambda t, y, args: y[0])), r"`event`.*\*\*kwargs"),
+        (dict(t1="1"), "`t1` must be a real number, got '1'"),
+        (dict(t0=None), "`t0` must be a real number, got NoneType"),
+        (dict(dt0=0.1j), "`dt0` must be a real number, got one of type complex128"),
+        (dict(solver=dfx.Tsit5(), y0="a"), "`y0` must be a pytree of real arrays.*str"),
+        (dict(stepsize_controller=dfx.PIDController(rtol="a", atol=0)), "`rtol` of `stepsize_con"),
     ],
 )
 def test_arguments_of_the_wrong_kind(arguments, message):
     with pytest.raises(TypeError, match=f"(?s){message}"):
         solve(**arguments)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (dict(t0=jnp.zeros(2)), r"`t0` must be one number, got an array of shape \(2,\)"),
+        (dict(t1=jnp.ones(2)), r"`t1` must be one number, got an array of shape \(2,\)"),
+        (dict(dt0=jnp.ones(2)), r"`dt0` must be one number, got an array of shape \(2,\)"),
+    ],
+)
+def test_times_that_are_no_single_number(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        solve(**arguments)
+
+
+@pytest.mark.parametrize(
+    ("rtol", "atol", "message"),
+    [
+        (float("nan"), 1e-6, "`rtol` of `stepsize_controller` must not be negative or NaN"),
+        (1e-6, jnp.array([1e-6, -1.0]), "`atol` of `stepsize_controller` must not be negative"),
+        (0.0, 0.0, "`rtol` and `atol` of `stepsize_controller` are both zero"),
+        (1e-6, jnp.ones(3), r"`atol` of `stepsize_controller`.*\(2,\), got shape \(3,\)"),
+    ],
+)
+def test_tolerances_that_no_step_could_meet(rtol, atol, message):
+    controller = dfx.PIDController(rtol=rtol, atol=atol)
+    for wrapped in (controller, dfx.ClipStepSizeController(controller)):
+        with pytest.raises(ValueError, match=message):
+            solve(stepsize_controller=wrapped)
+    with pytest.raises(ValueError, match=message):
+        mj.solve_ensemble(
+            TURN,
+            PROJECTED,
+            0.0,
+            jnp.ones(3),
+            None,
+            jnp.ones((3, 2)),
+            stepsize_controller=controller,
+        )
+
+
+def test_a_complex_vector_field_of_a_real_state():
+    """It would lose its imaginary part."""
+    message = r"The vector field in `terms` returns complex numbers.*\(z.real, z.imag\)"
+    turning = lambda t, y, args: 1j * y.astype(complex)
+    for solver in (PROJECTED, mj.Rodas5P(), dfx.Tsit5()):
+        with pytest.raises(TypeError, match=message):
+            solve(dfx.ODETerm(turning), solver)
+    with pytest.raises(TypeError, match=message):
+        solve(mj.MassMatrixTerm(turning, 1.0), mj.Rodas5P())
+    with pytest.raises(TypeError, match=message):
+        mj.solve_ensemble(dfx.ODETerm(turning), PROJECTED, 0.0, 1.0, 0.1, jnp.ones((3, 2)))
 
 
 def test_constant_steps_of_no_size():

@@ -23,11 +23,8 @@ def check_state(y: Y, name: str = "y0") -> None:
         raise ValueError(
             f"`{name}` has no array leaves: pass the state as a pytree of real arrays."
         )
+    check_leaves(y, name)
     for leaf in leaves:
-        if not eqx.is_array_like(leaf):
-            raise TypeError(
-                f"`{name}` must be a pytree of real arrays, but has a leaf of type {type(leaf).__name__}."
-            )
         dtype = jnp.result_type(leaf)
         if jnp.issubdtype(dtype, jnp.complexfloating):
             raise TypeError(
@@ -39,6 +36,25 @@ def check_state(y: Y, name: str = "y0") -> None:
                 f"`{name}` has a leaf of type {dtype}, which cannot be moved onto a manifold. "
                 f"Convert it: `{name} = jax.tree.map(lambda leaf: jnp.asarray(leaf, float), {name})`."
             )
+
+
+def check_leaves(y: Y, name: str) -> None:
+    for leaf in jtu.tree_leaves(y):
+        if not eqx.is_array_like(leaf):
+            raise TypeError(
+                f"`{name}` must be a pytree of real arrays, but has a leaf of type {type(leaf).__name__}."
+            )
+
+
+def check_field_is_real(field: Any, y: Y) -> None:
+    """Refuse a complex vector field of a real state, like it in structure: imaginary parts would be lost."""
+    is_complex = lambda leaf: jnp.issubdtype(jnp.result_type(leaf), jnp.complexfloating)
+    pairs = zip(jtu.tree_leaves(field), jtu.tree_leaves(y), strict=True)
+    if any(is_complex(value) and not is_complex(leaf) for value, leaf in pairs):
+        raise TypeError(
+            "The vector field in `terms` returns complex numbers for a real `y0`. Make the real and the imaginary "
+            "parts components of the state: pass e.g. `y0=(z.real, z.imag)`, and return the derivatives of both."
+        )
 
 
 def _is_list_of_numbers(node: Any) -> bool:

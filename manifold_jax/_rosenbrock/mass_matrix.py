@@ -17,7 +17,7 @@ from .._base.numbers import numbers_as_arrays
 from .._base.shapes import are_alike, shapes
 from .._base.types import Args, RealScalarLike, Y
 from .._base.user_functions import check_function
-from .._constraint.checks import check_state
+from .._constraint.checks import check_field_is_real, check_state
 from .._constraint.diagnosis import Diagnosis
 from .._constraint.projection_info import ProjectionInfo
 from .algebraic import consistent, faults_of_start, MassMatrixEquations
@@ -168,6 +168,7 @@ def ravelled_like(y: Y, value: Any) -> Float[Array, " n"]:
         raise ValueError(
             f"`vector_field` must return what `y` is made of, arrays of the shapes {shapes(y)}, got {shapes(value)}."
         )
+    check_field_is_real(value, y)
     return _ravelled(y, value)
 
 

@@ -14,7 +14,7 @@ from .._adjoint.events import EVENT_KEYWORDS
 from .._base.compat import save_y
 from .._base.types import Args, RealScalarLike, Y
 from .._base.user_functions import check_function
-from .._constraint.checks import has_no_equations
+from .._constraint.checks import check_field_is_real, has_no_equations
 from .._solver import Stabilized
 from .._solver.base import AbstractManifoldSolver, controller_tolerances
 from .._solver.stabilization import is_stable, stability_interval
@@ -78,8 +78,8 @@ def check_max_steps(max_steps: Any) -> None:
 
 
 def check_field(terms: Any, t0: Any, y0: Any, args: Any) -> None:
-    """Refuse a vector field of another shape than the state, which might be broadcast. Those of mechanical
-    systems and reduced DAEs have its shape, and take long to trace."""
+    """Refuse a vector field of another shape than the state, which might be broadcast, and a complex one of
+    a real state. Those of mechanical systems and reduced DAEs have its shape, and take long to trace."""
     module = getattr(getattr(terms, "vector_field", None), "__module__", None) or ""
     if not isinstance(terms, dfx.ODETerm) or module.startswith(_OWN_FIELDS):
         return
@@ -88,13 +88,32 @@ def check_field(terms: Any, t0: Any, y0: Any, args: Any) -> None:
     except Exception:  # raised again, with its place, where the solve evaluates it
         return
     shapes = [[jnp.shape(leaf) for leaf in jtu.tree_leaves(tree)] for tree in (field, y0)]
-    if jtu.tree_structure(field) != jtu.tree_structure(y0) or shapes[0] == shapes[1]:
+    if jtu.tree_structure(field) != jtu.tree_structure(y0):
         return  # Diffrax reports other structures
+    if shapes[0] == shapes[1]:
+        return check_field_is_real(field, y0)
     got, state = (jtu.tree_map(jnp.shape, tree) for tree in (field, y0))
     raise ValueError(
         f"The vector field in `terms` must be like the state, of shape {state}, but returns {got}: one velocity for "
         "every number of `y`."
     )
+
+
+def check_shape_of_tolerances(controller: Any, y0: Y) -> None:
+    """Refuse tolerances of other shapes than numbers of the state."""
+    tolerances = controller_tolerances(controller)
+    if tolerances is None:
+        return
+    for name in ("rtol", "atol"):
+        shape = jnp.shape(getattr(tolerances, name))
+        for leaf in map(jnp.shape, jtu.tree_leaves(y0)):
+            if len(shape) > len(leaf) or any(
+                a not in (1, b) for a, b in zip(shape[::-1], leaf[::-1], strict=False)
+            ):
+                raise ValueError(
+                    f"`{name}` of `stepsize_controller` must be a number, or an array with one for every number of the "
+                    f"state, of shape {leaf}, got shape {shape}."
+                )
 
 
 def _check_choices(adjoint: Any, consistent: str) -> None:

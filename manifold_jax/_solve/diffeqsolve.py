@@ -10,6 +10,7 @@ from .._base.errors import clear_errors
 from .._base.numbers import numbers_as_arrays
 from .._base.types import Args, RealScalarLike, Terms, Y
 from .._base.user_functions import evaluated
+from .._constraint.checks import check_leaves
 from .._resets.reset import check_resets
 from .._solver.base import AbstractManifoldSolver
 from .._solver.step.implicit import with_accurate_stages, with_tolerances_of_stages
@@ -18,23 +19,25 @@ from .arguments import (
     check_arguments,
     check_field,
     check_max_steps,
+    check_shape_of_tolerances,
     raise_if_unstable,
     warn_of_rounding,
     warn_of_unknown_hook,
     without_idle_hook,
 )
 from .finish import finish
+from .given_numbers import checking_numbers
 from .mass_matrix import trusting
 from .output import events_in_true_time, saving
 from .prepare import prepare, time_dtype
 from .resets import finish_resets, LoopArguments, with_resets
 from .setup import Consistent, ProblemData, Setup
 from .solution import Solution
-from .times import checking_first_step, refusing_missing_times
+from .times import refusing_missing_times
 
 
 @clear_errors
-@checking_first_step
+@checking_numbers()
 @numbers_as_arrays("y0", "args", times=("t0", "t1", "dt0"))
 @eqx.filter_jit
 @refusing_missing_times
@@ -119,7 +122,9 @@ def diffeqsolve(
     Source: Sudarsan & Keerthi, Appl. Math. Comput. 92 (1998) 153-193.
     """
     check_arguments(terms, solver, dt0, saveat, stepsize_controller, adjoint, event, consistent)
+    check_leaves(y0, "y0")
     check_field(terms, t0, y0, args)
+    check_shape_of_tolerances(stepsize_controller, y0)
     check_max_steps(max_steps)
     check_resets(resets, max_resets, controller_state)
     warn_of_rounding(y0, time_dtype(t0, t1, dt0, saveat), stepsize_controller)

@@ -29,24 +29,6 @@ _NO_START = "`t0` is NaN or infinite: it must be a number."
 _NO_END = "`t1` is NaN: it must be a number, or infinite if an event ends the solve."
 
 
-def checking_first_step(function: Function) -> Function:
-    """Wrap a solve whose numbers become arrays: refuse a first step that is known to be unusable."""
-    place = list(inspect.signature(function).parameters).index("dt0")
-
-    @functools.wraps(function)
-    def solve(*args: Any, **kwargs: Any) -> Any:
-        __tracebackhide__ = True
-        dt0 = args[place] if len(args) > place else kwargs.get("dt0")
-        if isinstance(dt0, int | float) and not 0 < abs(dt0) < float("inf"):
-            raise ValueError(
-                f"`dt0` must be the length of the first step, with the sign of t1 - t0, got {dt0}. With an adaptive "
-                "`stepsize_controller` it may be None."
-            )
-        return function(*args, **kwargs)
-
-    return cast(Function, solve)
-
-
 def is_time_missing(t0: RealScalarLike, t1: RealScalarLike) -> BoolScalar:
     return ~jnp.isfinite(t0) | jnp.isnan(t1)
 

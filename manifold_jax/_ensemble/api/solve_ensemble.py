@@ -19,11 +19,12 @@ from ..._resets.reset import check_resets
 from ..._solve.arguments import (
     check_arguments,
     check_field,
+    check_shape_of_tolerances,
     warn_of_rounding,
     without_idle_hook,
 )
+from ..._solve.given_numbers import checking_numbers
 from ..._solve.setup import Consistent
-from ..._solve.times import checking_first_step
 from ..lanes.arguments import (
     anywhere,
     Axes,
@@ -42,7 +43,7 @@ from .devices import check_mesh, default_lanes, over_devices
 
 @refuse_old_names(in_axes="args_axes")
 @clear_errors
-@checking_first_step
+@checking_numbers(several_times=True)
 @numbers_as_arrays("y0s", "args", times=("t0", "t1", "dt0"))
 @eqx.filter_jit
 def solve_ensemble(
@@ -123,6 +124,7 @@ def solve_ensemble(
         raise ValueError(f"`max_steps` must be a positive integer, got {max_steps!r}.")
     one = jax.eval_shape(batch.one)
     check_field(terms, one.t0, one.y0, one.args)
+    check_shape_of_tolerances(stepsize_controller, one.y0)
     warn_of_rounding(one.y0, batch.dtype, stepsize_controller)
     solver = without_idle_hook(solver, one.t0, one.y0, one.args)
     equations = LaneEquations(
