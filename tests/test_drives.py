@@ -191,8 +191,15 @@ def test_a_start_that_the_drive_does_not_allow():
     machine = mb.Assembly(CRANK, [*JOINTS, mb.Drive("pivot", crank_angle)])
     with pytest.raises(ValueError, match="velocities do not agree.*Drive pivot"):
         machine.state()
-    with pytest.raises(ValueError, match=r"does not satisfy the joints: Drive pivot \(gap 1\.9"):
+    gap = r"does not satisfy the joints: Drive pivot \(gap 1\.92 rad\)\. Give"
+    with pytest.raises(ValueError, match=gap):
         machine.state(t=0.5)
+    guided = mb.Assembly(CRANK, [*JOINTS, mb.Drive("guide", 0.5)])
+    with pytest.raises(ValueError, match=r"the joints: Drive guide \(gap 0\.5 m\)\. Give"):
+        guided.state()
+    moved = {"crank": (0.5, 0.1)}
+    with pytest.raises(ValueError, match=r"\(gap 0\.5 m\), .* \(gap 0\.1\), in m or the sine"):
+        guided.state(positions=moved)
     later = machine.state(assemble=True, t=0.5)
     assert later[0].orientation[0] == pytest.approx(float(crank_angle(0.5)), abs=1e-14)
 

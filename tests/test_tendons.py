@@ -81,3 +81,11 @@ def test_energy():
 def test_messages(force, message):
     with pytest.raises(ValueError, match=message):
         machine([force])
+
+
+@pytest.mark.parametrize(
+    "make", [lambda: mb.Tendon("shaft", (1.0,)), lambda: mb.Controller("shaft", abs)]
+)
+def test_one_name_is_no_list_of_letters(make):
+    with pytest.raises(TypeError, match=r"`joints` must be a tuple of names.*`\('shaft',\)`"):
+        make()

@@ -8,6 +8,15 @@ from typing import Any
 import equinox as eqx
 
 
+def _names(joints: Any) -> tuple[str, ...]:
+    """Return names of joints as a tuple; refuse a single one, which would be taken for a list of letters."""
+    if isinstance(joints, str):
+        raise TypeError(
+            f"`joints` must be a tuple of names, got the string {joints!r}: write `({joints!r},)`."
+        )
+    return tuple(joints)
+
+
 class AbstractForce(eqx.Module):
     """A force that acts on bodies, besides their weight."""
 
@@ -164,7 +173,7 @@ class Controller(AbstractForce):
     Its torques are not part of `Assembly.energy`. For values that do not depend on the state use [`Motor`][].
     """
 
-    joints: tuple[str, ...] = eqx.field(static=True, converter=tuple)
+    joints: tuple[str, ...] = eqx.field(static=True, converter=_names)
     law: Any
     name: str | None = eqx.field(static=True, default=None)
 
@@ -193,7 +202,7 @@ class Tendon(AbstractForce):
     Source: MuJoCo's XML reference, `tendon/fixed` and `actuator/general`.
     """
 
-    joints: tuple[str, ...] = eqx.field(static=True, converter=tuple)
+    joints: tuple[str, ...] = eqx.field(static=True, converter=_names)
     coefficients: Any
     value: Any = 0.0
     stiffness: Any = 0.0

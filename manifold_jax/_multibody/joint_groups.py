@@ -33,6 +33,13 @@ class JointGroup(eqx.Module):
             return DRIVEN[self.kind](sides, self.length)
         return (PLANAR if self.planar else SPATIAL)[self.kind](sides, self.length)
 
+    @property
+    def unit(self) -> str | None:
+        """The unit of the equations of drives; those of joints have several."""
+        if self.motions is None:
+            return None
+        return "rad" if self.kind is joints.Revolute else "m"
+
     def at(self, t: RealScalarLike, args: Args) -> "JointGroup":
         """Return the group with its motions at the time."""
         if self.motions is None:

@@ -152,27 +152,30 @@ class LoopClosure:
         what = "The velocities do not agree with the joints"
         advice = "Give only those that are known, such that joints allow them, and `assemble=True`."
         most = _closed(x) * max(1, np.abs(w).max())
-        self._refuse_gaps(np.abs(driven + J @ w), most, "in m/s or rad/s", what, advice)
+        self._refuse_gaps(np.abs(driven + J @ w), most, "in m/s or rad/s", what, advice, {})
         if not self.assembly.redundant:
             self._check_rank(J)
 
     def _check_positions(self, x: np.ndarray, advice: str) -> None:
         phi, _, _ = self.known(x)
         what = "The state does not satisfy the joints"
-        unit = "in m or the sine of an angle"
-        self._refuse_gaps(np.abs(phi), _closed(x), unit, what, advice)
+        groups = [group for group in self.assembly.joints if group.unit]
+        units = {name: f" {group.unit}" for group in groups for name in group.attachment.names}
+        gaps, unit = np.abs(phi), "in m or the sine of an angle"
+        self._refuse_gaps(gaps, _closed(x), unit, what, advice, units)
 
     def _refuse_gaps(
-        self, gaps: np.ndarray, most: float, unit: str, what: str, advice: str
+        self, gaps: np.ndarray, most: float, unit: str, what: str, advice: str, units: dict
     ) -> None:
-        """Raise with the names of the joints that have the largest gaps, if any gap is too large."""
+        """Raise with the joints of the largest gaps, if any is too large; some have `units` of their own."""
         if gaps.max(initial=0) <= most:
             return
         sizes = [(name, gaps[rows].max()) for name, rows in self.named_rows]
         order = np.argsort([size for _, size in sizes])[::-1][:5]
         largest = [sizes[i] for i in order if not sizes[i][1] <= most]
-        worst = ", ".join(f"{name} (gap {size:.3g})" for name, size in largest)
-        raise ValueError(f"{what}: {worst}, {unit}. {advice}")
+        worst = ", ".join(f"{name} (gap {x:.3g}{units.get(name, '')})" for name, x in largest)
+        others = "" if all(name in units for name, _ in largest) else f", {unit}"
+        raise ValueError(f"{what}: {worst}{others}. {advice}")
 
     def _check_rank(self, J: np.ndarray) -> None:
         solved = self.assembly.independent
