@@ -144,8 +144,12 @@ def test_swapped_arguments():
         with pytest.raises(TypeError, match="missing a required argument: 'y'") as error:
             function(START, CIRCLE)
         assert f"mj.{function.__name__}` takes the arguments `(constraint, t, y" in str(error.value)
-        with pytest.raises(TypeError, match="`constraint`.*comes first"):
+        with pytest.raises(TypeError, match=rf"order .* is `mj.{function.__name__}\(constraint, t"):
             function(START, 0.0, CIRCLE)
+    with pytest.raises(TypeError, match=r"order .* is `mj.linearize\(terms, constraint, t"):
+        mj.linearize(CIRCLE, SYSTEM.terms, 0.0, START)
+    with pytest.raises(TypeError, match="got None. Without a constraint use the solver alone"):
+        mj.Projected(dfx.Tsit5(), None)
 
 
 def test_several_times_at_once():

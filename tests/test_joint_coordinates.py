@@ -187,8 +187,25 @@ def test_trees_have_no_constraint():
     energy = assembly.energy(joints.poses(solve(joints.terms, None, y0).ys))
     np.testing.assert_allclose(energy.total, energy.total[0], rtol=0, atol=1e-9)
     assert np.ptp(energy.kinetic) > 1
-    with pytest.raises(ValueError, match="there are no constraints. Use `terms`"):
-        joints.system  # noqa: B018
+
+
+def test_a_tree_as_a_mechanical_system():
+    """A bar on a hinge has no equations: steps of RATTLE are those of Verlet in its angle, and it hangs at rest."""
+    bar, hinge = (
+        mb.Body("bar", 2.0, 0.3, position=(0.5, 0)),
+        mb.Revolute(mb.GROUND, "bar", at=(0, 0)),
+    )
+    joints = mb.JointCoordinates(mb.Assembly([bar], [hinge], gravity=(0, -9.81), redundant=True))
+    q, v, h = jnp.array([0.4]), jnp.array([1.5]), 0.1
+    fall = lambda q: -9.81 * np.cos(q) / 0.8
+    middle = v + h / 2 * fall(q)
+    after = q + h * middle
+    hook = mj.rattle(joints.system)
+    ys = mj.diffeqsolve(joints.terms, hook, 0.0, h, h, (q, v), max_steps=1).ys
+    np.testing.assert_allclose(ys, ([after], [middle + h / 2 * fall(after)]), rtol=1e-13)
+    found = mj.equilibrium(joints.system, jnp.array([-1.2]))
+    assert float(found.q[0]) == pytest.approx(-np.pi / 2)
+    assert found.multipliers.size == 0
 
 
 def test_gradients_by_numbers_of_the_assembly():

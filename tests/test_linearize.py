@@ -89,6 +89,22 @@ def test_a_regulator_holds_a_pole():
     np.testing.assert_allclose(found, np.sort_complex(np.linalg.eigvals(A - B @ gains)), rtol=1e-9)
 
 
+@pytest.mark.parametrize("constraint", [None, mj.Constraint(lambda t, y, args: jnp.zeros(0))])
+def test_without_a_constraint(constraint):
+    """The pole in the coordinates of its joints, a tree: those of the textbook."""
+    joints = mb.JointCoordinates(cart_and_pole(lambda t, y, args: args))
+    near = mj.linearize(joints.terms, constraint, 0.0, joints.state(), jnp.zeros(1))
+    M = np.array([[1.3, -0.075], [-0.075, 0.3 * 0.25 / 3]])
+    fall = np.linalg.solve(M, np.diag([0, 9.81 * 0.075]))
+    push = np.linalg.solve(M, [[1.0], [0.0]])
+    nothing = np.zeros((2, 2))
+    np.testing.assert_allclose(near.basis, np.eye(4))
+    np.testing.assert_allclose(
+        near.matrix, np.block([[nothing, np.eye(2)], [fall, nothing]]), atol=1e-12
+    )
+    np.testing.assert_allclose(near.by_args, np.vstack([0 * push, push]), atol=1e-13)
+
+
 def test_controllers_are_checked():
     two = cart_and_pole(lambda t, y, args: jnp.zeros(2))
     with pytest.raises(ValueError, match=r"one value for each of its joints, shape \(1,\)"):

@@ -41,6 +41,16 @@ def test_a_point_on_a_circle():
     assert found(-1.0, found.ys[0] + tangents[0] * s)[0] == pytest.approx(1 - expected[0])
 
 
+def test_without_a_constraint():
+    """A pendulum that a torque holds upright, for ever: the gains of the algebraic Riccati equation."""
+    pendulum = dfx.ODETerm(lambda t, y, u: jnp.stack([y[1], 9.81 * jnp.sin(y[0]) + u[0]]))
+    A, B = np.array([[0, 1], [9.81, 0]]), np.array([[0.0], [1.0]])
+    S = scipy.linalg.solve_continuous_are(A, B, 3.0 * np.eye(2), 0.5 * np.eye(1))
+    given = around(2, ys=jnp.zeros((2, 2)), inputs=jnp.zeros((2, 1)), final_weights=S)
+    found = mj.regulate(pendulum, None, **given)
+    np.testing.assert_allclose(found.gains, np.broadcast_to(2 * S[1], (2, 1, 2)), rtol=1e-11)
+
+
 def pushed(t, q, v, u):
     """Weight and a horizontal force."""
     return jnp.concatenate([u, jnp.array([-9.81])])

@@ -13,7 +13,7 @@ from jaxtyping import Array, Complex, Float
 
 from .._base.numbers import numbers_as_arrays
 from .._base.types import Args, RealScalarLike, Y
-from .._constraint.checks import check_constraint_type
+from .._constraint.checks import as_constraint
 from .._constraint.constraint import AbstractConstraint
 from .._constraint.residual import residual_vector
 from .._linalg.dense import pseudo_invert
@@ -57,7 +57,7 @@ class Linearization(eqx.Module):
 @numbers_as_arrays("args", times=("t",))
 def linearize(
     terms: Any,
-    constraint: AbstractConstraint,
+    constraint: AbstractConstraint | None,
     t: RealScalarLike,
     y: Y,
     args: Args = None,
@@ -68,7 +68,9 @@ def linearize(
 
     At an equilibrium the eigenvalues of `A` are those of all small motions that the constraint allows:
     as many as degrees of freedom, without the spurious ones at zero that the equations in all coordinates
-    have. Along a motion `A` belongs to tangent vectors that do not turn in the tangent space.
+    have. Along a motion `A` belongs to tangent vectors that do not turn in the tangent space: its eigenvalues depend on
+    the coordinates of the state and do not decide on stability (a top that spins upright has other ones in poses than in
+    the angles of its joints).
 
     ```python
     at_rest = mj.linearize(system.terms, system.constraint, 0.0, y0, args)
@@ -80,8 +82,10 @@ def linearize(
 
     - `terms`: the vector field, a `diffrax.ODETerm`, such as `MechanicalSystem.terms`. It must be tangent to
         the manifold, see [`tangent_field`][].
-    - `constraint`: the manifold. With `redundant=True` the number of its dimensions must be found from the
-        numbers: not inside `jit` or derivatives.
+    - `constraint`: the manifold, or `None` for all of the state space, such as that of
+        [`JointCoordinates`][manifold_jax.multibody.JointCoordinates] of a tree: `z` are then the numbers of
+        `y`. With `redundant=True` the number of its dimensions must be found from the numbers: not inside `jit` or
+        derivatives.
     - `t`, `y`, `args`: where to linearize. `y` must be on the manifold, see [`consistent_state`][].
 
     **Returns:** a [`Linearization`][]. Its derivatives by `y` and `args` are those of a basis that moves with
@@ -93,7 +97,7 @@ def linearize(
     Source: Haug, Computer Aided Kinematics and Dynamics of Mechanical Systems (1989); Negrut & Ortiz,
     J. Comput. Nonlinear Dyn. 1 (2006) 230-239 (linearization of constrained mechanisms).
     """
-    check_constraint_type(constraint)
+    constraint = as_constraint(constraint, "linearize(terms, constraint, t, y, args)")
     y = jtu.tree_map(jnp.asarray, y)
     G = _jacobian(constraint, t, y, args)
     kept = _basis(jax.lax.stop_gradient(G), constraint.redundant)

@@ -17,7 +17,7 @@ from .._base.compat import is_okay, nonlinear_failure
 from .._base.errors import clear_errors
 from .._base.numbers import numbers_as_arrays
 from .._base.types import Args, BoolScalar, FloatScalar, RealScalarLike, Y
-from .._constraint.checks import check_constraint, check_state
+from .._constraint.checks import check_constraint, check_constraint_type, check_state
 from .._constraint.constraint import AbstractConstraint, Constraint
 from .._constraint.residual import residual_vector, row_scale
 from .._constraint.settings import NewtonProjection
@@ -141,6 +141,7 @@ def gradient_flow(
     Source: Sudarsan & Keerthi, Appl. Math. Comput. 92 (1998) 153-193, section 2.2 (d); Tanabe, J.
     Optim. Theory Appl. 30 (1980) 333-359; Yamashita, Math. Program. 18 (1980) 155-168.
     """
+    check_constraint_type(constraint, "gradient_flow(objective, constraint, x0, args)")
     check_state(x0, "x0")
     x0 = jtu.tree_map(jnp.asarray, x0)
     check_constraint(constraint, 0.0, x0, args)

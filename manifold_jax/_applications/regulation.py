@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 
 from .._base.numbers import numbers_as_arrays
 from .._base.types import RealScalarLike, Y
-from .._constraint.checks import check_constraint_type, check_state
+from .._constraint.checks import as_constraint, check_state
 from .._constraint.constraint import AbstractConstraint
 from .linearization import linearize
 
@@ -78,7 +78,7 @@ class Regulator(eqx.Module):
 @numbers_as_arrays("state_weights", "input_weights", "final_weights")
 def regulate(
     terms: Any,
-    constraint: AbstractConstraint,
+    constraint: AbstractConstraint | None,
     ts: Any,
     ys: Y,
     inputs: Any,
@@ -108,7 +108,7 @@ def regulate(
     **Arguments:**
 
     - `terms`: a `diffrax.ODETerm` whose `args` are the inputs `u`, shape `(m,)`. Other parameters are closed over.
-    - `constraint`: the manifold, whose equations are independent.
+    - `constraint`: the manifold, whose equations are independent, or `None` for all of the state space.
     - `ts`: at least two times, increasing, shape `(K,)`, such as `sol.ts` of `SaveAt(ts=...)`.
     - `ys`: the states at these times, on the manifold, such as `sol.ys`.
     - `inputs`: `u*` at these times, shape `(K, m)`.
@@ -130,7 +130,7 @@ def regulate(
     Trans. Autom. Control 18 (1973) 71-73 (Riccati equations by exponentials); Posa, Kuindersma & Tedrake, ICRA
     2016, 1366-1373 (on the tangent space of constraints).
     """
-    check_constraint_type(constraint)
+    constraint = as_constraint(constraint, "regulate(terms, constraint, ts, ys, inputs)")
     ts, ys, inputs = _checked_trajectory(ts, ys, inputs)
     n = sum(leaf[0].size for leaf in jtu.tree_leaves(ys))
     weights = (

@@ -14,8 +14,8 @@ from jaxtyping import Array, Bool, Float, Int
 
 from .._base.numbers import numbers_as_arrays
 from .._base.types import FloatScalar, RealScalarLike, Y
-from .._constraint.checks import check_constraint_type, has_no_equations
-from .._constraint.constraint import AbstractConstraint
+from .._constraint.checks import as_constraint, has_no_equations
+from .._constraint.constraint import AbstractConstraint, NoConstraint
 from .._constraint.project import consistent_state
 from .quasi_newton import minimize
 from .shooting import Charts, Shooting
@@ -68,7 +68,7 @@ class OptimalTrajectory(eqx.Module):
 @numbers_as_arrays("y0")
 def optimize_trajectory(
     terms: Any,
-    constraint: AbstractConstraint,
+    constraint: AbstractConstraint | None,
     ts: Any,
     y0: Y,
     inputs: Any,
@@ -105,7 +105,7 @@ def optimize_trajectory(
     **Arguments:**
 
     - `terms`: a `diffrax.ODETerm` whose `args` are the inputs `u`, shape `(m,)`. Other parameters are closed over.
-    - `constraint`: the manifold, which does not depend on the inputs.
+    - `constraint`: the manifold, which does not depend on the inputs, or `None` for all of the state space.
     - `ts`: the `K` times, increasing; about as many as are needed to draw the motion by hand.
     - `y0`: the first state, made consistent.
     - `inputs`: a guess of the inputs, shape `(K, m)`, clipped to `bounds`; zeros often do.
@@ -141,14 +141,12 @@ def optimize_trajectory(
     Source: Bock & Plitt, IFAC Proc. 17 (1984) 1603-1608 (multiple shooting); Bordalba, Schoels, Ros, Porta & Diehl,
     IEEE Trans. Robot. 39 (2023) 183-202 (charts at the knots).
     """
-    check_constraint_type(constraint)
+    constraint = as_constraint(constraint, "optimize_trajectory(terms, constraint, ts, y0, inputs)")
     check_setting(terms, ts, y0, inputs, steps)
     ts, u = checked_inputs(ts, inputs)
     limits = checked_bounds(bounds, u.shape[1])
     if has_no_equations(constraint, ts[0], y0, u[0]):
-        raise ValueError(
-            "`constraint` has no equations. Write one that the states satisfy, such as `mj.Constraint(g)`."
-        )
+        constraint = NoConstraint()
     y0, _ = consistent_state(constraint, ts[0], jtu.tree_map(jnp.asarray, y0), u[0])
     check_number("cost", cost, ts[0], y0, u[0])
     if final_cost is not None:

@@ -62,7 +62,8 @@ def _is_list_of_numbers(node: Any) -> bool:
     return isinstance(node, list) and len(node) > 0 and all(map(is_number, node))
 
 
-def check_constraint_type(constraint: Any) -> None:
+def check_constraint_type(constraint: Any, call: str) -> None:
+    """Refuse what is not a constraint; `call` is how the function that it was given to is called."""
     if isinstance(constraint, AbstractConstraint):
         return
     got = f"`constraint` must be an `mj.Constraint`, got {type(constraint).__name__}."
@@ -70,7 +71,15 @@ def check_constraint_type(constraint: Any) -> None:
         raise TypeError(f"{got} Pass its manifold: `system.constraint`.")
     if callable(constraint):
         raise TypeError(f"{got} Wrap a residual function: `mj.Constraint(lambda t, y, args: ...)`.")
-    raise TypeError(f"{got} The constraint comes first: `(constraint, t, y, args)`.")
+    raise TypeError(f"{got} The order of the arguments is `mj.{call}`.")
+
+
+def as_constraint(constraint: AbstractConstraint | None, call: str) -> AbstractConstraint:
+    """Return the manifold, which is all of the state space without a constraint."""
+    if constraint is None:
+        return NoConstraint()
+    check_constraint_type(constraint, call)
+    return constraint
 
 
 def has_no_equations(constraint: AbstractConstraint, t: RealScalarLike, y: Y, args: Args) -> bool:
@@ -84,8 +93,7 @@ def has_no_equations(constraint: AbstractConstraint, t: RealScalarLike, y: Y, ar
 
 
 def check_constraint(constraint: AbstractConstraint, t: RealScalarLike, y: Y, args: Args) -> int:
-    """Refuse, while tracing, constraints of the wrong type or shape. Returns `m`."""
-    check_constraint_type(constraint)
+    """Refuse, while tracing, constraints of the wrong shape. Returns `m`."""
     if isinstance(constraint, NoConstraint):
         return 0
     try:

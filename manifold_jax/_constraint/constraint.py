@@ -233,3 +233,8 @@ class NoConstraint(AbstractConstraint):
 
     def __call__(self, t: RealScalarLike, y: Y, args: Args = None) -> Residual:
         return jnp.zeros(0)
+
+    def correct(
+        self, projection, t, y, args=None, *, fallback=None, far=False, directions=None
+    ) -> tuple[Y, ProjectionInfo]:
+        return y, ProjectionInfo.of_nothing(y, jnp.asarray(True))

@@ -61,6 +61,7 @@ def project(
 
     [`consistent_state`][] is the same for initial values.
     """
+    check_constraint_type(constraint, "project(constraint, t, y, args)")
     projection = NewtonProjection(max_steps=50) if projection is None else projection
     return moved(projection, constraint, t, y, args, "y", throw)
 
@@ -97,6 +98,7 @@ def consistent_state(
     A `RuntimeError` (under `jit` too) that says whether the state or the constraint was not finite, its
     Jacobian rank deficient, or the equations could not be satisfied.
     """
+    check_constraint_type(constraint, "consistent_state(constraint, t, y, args)")
     projection = NewtonProjection() if projection is None else projection
     patient = dataclasses.replace(projection, max_steps=max(50, projection.max_steps))
     return moved(patient, constraint, t, y, args, "y0", throw)
@@ -112,7 +114,6 @@ def moved(
     throw: bool,
 ) -> tuple[Y, ProjectionInfo]:
     """Move one point that may be far from the manifold; `name` is its name in messages."""
-    check_constraint_type(constraint)
     check_state(y, name)
     y = jtu.tree_map(jnp.asarray, y)
     check_constraint(constraint, t, y, args)

@@ -41,7 +41,7 @@ def constraint_violation(
     The scale is not smaller for states smaller than 1: a point that is off by all of the size `s` of a
     state has a violation of about `s`. Rescale states below 1e-6, see [`NewtonProjection`][].
     """
-    check_constraint_type(constraint)
+    check_constraint_type(constraint, "constraint_violation(constraint, t, y, args)")
     check_state(y, "y")
     t = jnp.asarray(t)
     if t.ndim > 1:

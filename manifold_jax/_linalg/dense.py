@@ -178,7 +178,7 @@ def pseudo_invert(A: Float[Array, "m m"], dependent: Any = DEPENDENCE_THRESHOLD)
 def is_rounding(sizes: Float[Array, " m"]) -> Bool[Array, " m"]:
     """Whether sizes of gradients are rounding beside the largest: those of redundant equations that hold identically,
     such as the diagonal of `S^T J S = J`."""
-    return sizes <= 16 * jnp.finfo(sizes.dtype).eps * jnp.max(sizes)
+    return sizes <= 16 * jnp.finfo(sizes.dtype).eps * jnp.max(sizes, initial=0)
 
 
 @ForwardRule
@@ -186,7 +186,7 @@ def _pseudo_inverse(A: Float[Array, "m m"], dependent: FloatScalar) -> Float[Arr
     """Return the pseudo-inverse of a symmetric matrix. (The derivative of `jnp.linalg.pinv` cannot be
     differentiated again if `rtol` is an array.)"""
     values, V = lapack.eigh(A)
-    used = jnp.abs(values) > dependent * jnp.max(jnp.abs(values))
+    used = jnp.abs(values) > dependent * jnp.max(jnp.abs(values), initial=0)
     return (V * jnp.where(used, 1 / jnp.where(used, values, 1), 0)[None, :]) @ V.T
 
 

@@ -37,7 +37,7 @@ class WrittenOut(eqx.Module):
             for k in range(i + 1, m):
                 x[i] = x[i] - lu[i][k] * x[k]
             x[i] = x[i] / lu[i][i]
-        return jnp.stack(x)
+        return jnp.stack(x) if x else b  # without constraints
 
     def solve_transposed(self, b: Float[Array, "m ..."]) -> Float[Array, "m ..."]:
         lu, m = self.lu, len(self.lu)
@@ -49,7 +49,7 @@ class WrittenOut(eqx.Module):
         for i in reversed(range(m)):
             for k in range(i + 1, m):
                 x[i] = x[i] - lu[k][i] * x[k]
-        return jnp.stack(x)
+        return jnp.stack(x) if x else b  # without constraints
 
 
 class TriangularFactors(eqx.Module):

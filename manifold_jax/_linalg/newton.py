@@ -78,7 +78,7 @@ class _Search(NamedTuple):
         return r, self.scaled(r)
 
     def scaled(self, r: Float[Array, " m"]) -> FloatScalar:
-        return jnp.max(jnp.abs(r) / self.scale)
+        return jnp.max(jnp.abs(r) / self.scale, initial=0)
 
     def lowered(self, state: Iterate, dz: Float[Array, " m"]) -> Iterate:
         """Return the step to `z - dz` if it lowers the residual, else the state as it was."""

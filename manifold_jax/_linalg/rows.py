@@ -78,7 +78,7 @@ def combine(weights: Inexact[Array, " m"], rows: Rows) -> Inexact[Array, " n"]:
         return rows.combine(weights)
     if rows.shape[0] > UNROLL_LIMIT:
         return weights @ rows
-    if rows.shape[0] > _MOST_WRITTEN_OUT:
+    if not 1 <= rows.shape[0] <= _MOST_WRITTEN_OUT:
         return jnp.sum(weights[:, None] * rows, axis=0)
     return sum(weights[i] * rows[i] for i in range(rows.shape[0]))  # pyright: ignore[reportReturnType]
 

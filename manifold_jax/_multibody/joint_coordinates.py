@@ -61,7 +61,8 @@ class JointCoordinates(eqx.Module):
         first. Bodies that no joints but rods tie to the ground have the coordinates of a `Pose`.
     - `terms`, `constraint`: the vector field on `(q, v)` with `v = dq/dt`, and the manifold; `None` if all joints are
         part of the tree, which is then solved by any solver alone.
-    - `system`: both as a [`MechanicalSystem`][manifold_jax.MechanicalSystem].
+    - `system`: both as a [`MechanicalSystem`][manifold_jax.MechanicalSystem], of a tree one with no equations, for
+        [`equilibrium`][manifold_jax.equilibrium] and [`rattle`][manifold_jax.rattle].
 
     The tree is the one with the fewest coordinates among those with all joints that have [`RotorInertia`][] or
     [`Coupling`][].
@@ -107,14 +108,11 @@ class JointCoordinates(eqx.Module):
 
     @property
     def system(self) -> MechanicalSystem:
-        if not self._has_constraints:
-            raise ValueError(
-                "All joints are part of the tree: there are no constraints. Use `terms` and the solver alone."
-            )
         source = ConstantAssembly(self.assembly)
         equations = LoopEquations(source, self.tree, self.independent)
         mass, forces = TreeMass(source, self.tree), TreeForces(source, self.tree)
-        redundant = self.assembly.redundant and self.assembly.independent is None
+        is_independent = not self._has_constraints or self.assembly.independent is not None
+        redundant = self.assembly.redundant and not is_independent
         return MechanicalSystem(mass, equations, forces, redundant=redundant, structure="dense")
 
     @property

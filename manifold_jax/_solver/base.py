@@ -216,7 +216,12 @@ def controller_tolerances(controller: Any) -> dfx.PIDController | None:
 
 def check_hook_arguments(solver: Any, constraint: Any, hook: str) -> None:
     _check_inner_solver(solver, hook)
-    check_constraint_type(constraint)
+    if constraint is None:
+        raise TypeError(
+            "`constraint` must be an `mj.Constraint`, got None. Without a constraint use the solver alone, not in "
+            f"`{hook}`."
+        )
+    check_constraint_type(constraint, f"{hook}(solver, constraint)")
 
 
 def _check_inner_solver(solver: Any, hook: str) -> None:

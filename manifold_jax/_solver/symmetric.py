@@ -179,7 +179,7 @@ class SymmetricProjection(AbstractStepsOnManifold):
     projection: NewtonProjection
 
     def __init__(self, constraint: AbstractConstraint, *, order: Order = 2):
-        check_constraint_type(constraint)
+        check_constraint_type(constraint, "SymmetricProjection(constraint)")
         check_order(order)
         if constraint.redundant:
             raise ValueError(

@@ -62,7 +62,7 @@ def tangent_field(
     """
     advice = "Of a Diffrax term pass its `vector_field`."
     check_function("function", function, "f(t, y, args)", advice=advice)
-    check_constraint_type(constraint)
+    check_constraint_type(constraint, "tangent_field(function, constraint)")
     return TangentField(
         function, constraint, NewtonProjection() if projection is None else projection
     )
