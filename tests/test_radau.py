@@ -314,6 +314,17 @@ def test_stages_that_do_not_converge():
     np.testing.assert_array_equal(y1, start)
 
 
+@pytest.mark.parametrize("solver", [RADAU, mj.Rodas5P(), dfx.Kvaerno5()])
+def test_zeros_without_an_absolute_tolerance(solver):
+    """One component leaves zero, another one stays there, where the error is zero of a tolerance of zero."""
+    field = dfx.ODETerm(lambda t, y, args: jnp.stack([-y[0], y[0] - y[1], -y[2]]))
+    controller = dfx.PIDController(rtol=1e-6, atol=0)
+    options = dict(stepsize_controller=controller, max_steps=32, throw=False)
+    sol = mj.diffeqsolve(field, solver, 0.0, 1.0, None, jnp.array([1.0, 0.0, 0.0]), **options)
+    np.testing.assert_allclose(sol.ys[0], np.exp(-1) * np.array([1, 1, 0]), rtol=1e-5)
+    assert sol.stats["num_rejected_steps"] < 3
+
+
 def test_controls_are_refused():
     control = dfx.LinearInterpolation(jnp.linspace(0, 1, 3), jnp.linspace(0, 1, 3))
     terms = dfx.ControlTerm(lambda t, y, args: -y, control)

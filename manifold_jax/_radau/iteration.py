@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
+from jaxtyping import Array
 
 from .._base.types import BoolScalar, FloatScalar, IntScalar, Y
 from .stages import SimplifiedNewton, StageEquations, Stages
@@ -15,11 +16,18 @@ from .stages import SimplifiedNewton, StageEquations, Stages
 _KAPPA = 1e-2
 
 
-def size_in_tolerances(tolerances: Any, change: Y, y: Y) -> FloatScalar:
-    """Return the size of a change of the state `y` in units of the tolerance."""
-    scaled = lambda dx, x: dx / (tolerances.atol + tolerances.rtol * jnp.abs(x))
+def size_in_tolerances(tolerances: Any, change: Y, y0: Y, y1: Y) -> FloatScalar:
+    """Return the size of a change in units of the tolerance, that of the larger of the states at the beginning
+    and at the end, as for the error of the step: a component may begin at zero. Where nothing changes the size
+    is zero, also without any tolerance."""
+
+    def scaled(dx: Array, x0: Array, x1: Array) -> Array:
+        largest = jnp.maximum(jnp.abs(x0), jnp.abs(x1))
+        tolerance = tolerances.atol + tolerances.rtol * largest
+        return jnp.where(dx == 0, 0, dx / jnp.where(dx == 0, 1, tolerance))
+
     with jax.numpy_dtype_promotion("standard"):
-        return jnp.asarray(tolerances.norm(jtu.tree_map(scaled, change, y)))
+        return jnp.asarray(tolerances.norm(jtu.tree_map(scaled, change, y0, y1)))
 
 
 class StageIterate(NamedTuple):
@@ -39,22 +47,23 @@ def solve_stages(
     equations: StageEquations,
     newton: SimplifiedNewton,
     guess: Stages,
-    size: Callable[[Stages], FloatScalar],
+    size: Callable[[Stages, Stages], FloatScalar],
     rounding: FloatScalar,
     most: int,
 ) -> tuple[Stages, BoolScalar]:
     r"""Iterate to round-off, without derivatives: until the error, estimated from the rate $\theta$ of
     convergence as $|\Delta Z| \theta / (1 - \theta)$, has at most the size `rounding`, or changes below
-    `_KAPPA` no longer shrink.
+    `_KAPPA` no longer shrink. `size` is that of a change that led to these stages.
 
     Where iterations end before, stages are solved if their error is below `_KAPPA`.
     """
 
     def advance(i: StageIterate) -> StageIterate:
         change = newton.step(equations.residual(i.Z))
-        new = size(change)
+        Z = i.Z + change
+        new = size(change, Z)
         status = _status(new, i, rounding, most)
-        return StageIterate(i.Z + change, new, i.size, i.iterations + 1, status)
+        return StageIterate(Z, new, i.size, i.iterations + 1, status)
 
     zero = jnp.zeros((), rounding.dtype)
     first = StageIterate(guess, zero, zero, jnp.asarray(0), jnp.asarray(_GOES_ON))

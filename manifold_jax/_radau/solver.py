@@ -159,15 +159,16 @@ class RadauIIA5(AbstractMassMatrixSolver, dfx.AbstractImplicitSolver):
         V0 = jnp.zeros_like(x0) if derivative is None else h.astype(x0.dtype) * derivative
         newton = equations.at_start(V0)
         unravel = jfu.ravel_pytree(equations.system.y0)[1]
-        y0 = unravel(x0)
-        size = lambda dx: size_in_tolerances(self.root_finder, unravel(dx), y0)
+        size = lambda dx, z: size_in_tolerances(
+            self.root_finder, unravel(dx), unravel(x0), unravel(x0 + z)
+        )
         unit = 8 * jnp.finfo(x0.dtype).eps
         Z, solved = solve_stages(
             equations,
             newton,
             _guess(state, h),
-            lambda dZ: jnp.max(jax.vmap(size)(dZ)),
-            size(unit * x0),
+            lambda dZ, Z: jnp.max(jax.vmap(size)(dZ, Z)),
+            size(unit * x0, jnp.zeros_like(x0)),
             self.root_find_max_steps,
         )
         combination = constant(ERROR, Z) @ Z
@@ -179,7 +180,7 @@ class RadauIIA5(AbstractMassMatrixSolver, dfx.AbstractImplicitSolver):
             f = equations.rest(t0, x0 + error, V0) + product(newton.M, V0)
             return newton.filtered(f, combination)
 
-        error = jax.lax.cond(size(error) < 1, lambda: error, again)
+        error = jax.lax.cond(size(error, Z[2]) < 1, lambda: error, again)
         solved &= newton.nonsingular
         Z = jnp.where(solved, Z, 0)
         return _StagesOfStep(Z, error, newton.defined, solved)

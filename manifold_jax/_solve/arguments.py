@@ -166,6 +166,20 @@ def without_idle_hook(solver: Any, t0: RealScalarLike, y0: Y, args: Args) -> Any
     return solver.inner if has_no_equations(solver.constraint, t0, y0, args) else solver
 
 
+def with_positive_tolerance(controller: Any, y0: Y) -> Any:
+    """Return the controller with an `atol` of at least the smallest number. With none the error of a component
+    that is zero and stays so would be `0 / 0`, and no step would ever be accepted."""
+    tolerances = controller_tolerances(controller)
+    if tolerances is None:
+        return controller
+    with jax.numpy_dtype_promotion("standard"):
+        dtypes = [jnp.result_type(float, leaf) for leaf in jtu.tree_leaves(y0)]
+    smallest = max((float(jnp.finfo(dtype).tiny) for dtype in dtypes), default=0.0)
+    larger = max if isinstance(tolerances.atol, int | float) else jnp.maximum
+    atol = larger(tolerances.atol, smallest)
+    return eqx.tree_at(lambda c: controller_tolerances(c).atol, controller, atol)
+
+
 def warn_of_rounding(y0: Y, time: Any, controller: Any) -> None:
     """Warn of tolerances, if known, that are below the resolution of 32-bit numbers."""
     tolerances = controller_tolerances(controller)

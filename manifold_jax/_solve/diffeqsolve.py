@@ -23,6 +23,7 @@ from .arguments import (
     raise_if_unstable,
     warn_of_rounding,
     warn_of_unknown_hook,
+    with_positive_tolerance,
     without_idle_hook,
 )
 from .finish import finish
@@ -128,6 +129,7 @@ def diffeqsolve(
     check_max_steps(max_steps)
     check_resets(resets, max_resets, controller_state)
     warn_of_rounding(y0, time_dtype(t0, t1, dt0, saveat), stepsize_controller)
+    stepsize_controller = with_positive_tolerance(stepsize_controller, y0)
     constraint = getattr(solver, "constraint", None)
     if isinstance(solver, AbstractManifoldSolver):
         terms, solver = evaluated((terms, solver), args)

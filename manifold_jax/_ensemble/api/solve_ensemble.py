@@ -21,6 +21,7 @@ from ..._solve.arguments import (
     check_field,
     check_shape_of_tolerances,
     warn_of_rounding,
+    with_positive_tolerance,
     without_idle_hook,
 )
 from ..._solve.given_numbers import checking_numbers
@@ -130,7 +131,7 @@ def solve_ensemble(
     equations = LaneEquations(
         terms,
         solver,
-        stepsize_controller,
+        with_positive_tolerance(stepsize_controller, one.y0),
         saveat,
         dt0,
         adjoint,
