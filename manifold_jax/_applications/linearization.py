@@ -69,8 +69,8 @@ def linearize(
     At an equilibrium the eigenvalues of `A` are those of all small motions that the constraint allows:
     as many as degrees of freedom, without the spurious ones at zero that the equations in all coordinates
     have. Along a motion `A` belongs to tangent vectors that do not turn in the tangent space: its eigenvalues depend on
-    the coordinates of the state and do not decide on stability (a top that spins upright has other ones in poses than in
-    the angles of its joints).
+    the coordinates of the state and do not decide on stability. (Those of a top that spins upright are others in poses
+    than in the coordinates of its joint.)
 
     ```python
     at_rest = mj.linearize(system.terms, system.constraint, 0.0, y0, args)
