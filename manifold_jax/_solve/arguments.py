@@ -1,7 +1,7 @@
 """Checks of the arguments of `mj.diffeqsolve`; messages say what to write instead."""
 
 import warnings
-from typing import Any
+from typing import Any, cast
 
 import diffrax as dfx
 import equinox as eqx
@@ -177,7 +177,8 @@ def with_positive_tolerance(controller: Any, y0: Y) -> Any:
     smallest = max((float(jnp.finfo(dtype).tiny) for dtype in dtypes), default=0.0)
     larger = max if isinstance(tolerances.atol, int | float) else jnp.maximum
     atol = larger(tolerances.atol, smallest)
-    return eqx.tree_at(lambda c: controller_tolerances(c).atol, controller, atol)
+    found = lambda controller: cast(Any, controller_tolerances(controller)).atol
+    return eqx.tree_at(found, controller, atol)
 
 
 def warn_of_rounding(y0: Y, time: Any, controller: Any) -> None:
