@@ -117,7 +117,7 @@ def consistent_state(
         near = info.residual <= NewtonProjection().tolerance_for(z.dtype)
         cause = jnp.where(info.full_rank, jnp.where(near, 2, 1), 0)
         cause = jnp.where(info.success, 0, cause)
-        z = _raise_unless(info.success, z, cause, tuple(_messages(guess)))
+        z = _raise_unless(info.success, z, cause, tuple(_messages(guess, system.analysis.implicit)))
     return z, info
 
 
@@ -189,12 +189,18 @@ def _solve_leading_equations(
     return implicit_root(leading, found), jax.lax.stop_gradient(small)
 
 
-def _messages(guess: Guess) -> list[str]:
+def _messages(guess: Guess, implicit: bool) -> list[str]:
     held = f" with {listed(list(guess.names))} fixed" if guess.names else ""
     advice = " Fix less, or other unknowns." if guess.names else ""
+    other_form = (
+        ""
+        if implicit
+        else " If they are independent, but some by less than 1e-8 of the others (diodes at rest), write "
+        "`mj.reduce_dae(..., form='index-1')`."
+    )
     return [
         f"The equations of `F` and their derivatives cannot be satisfied near `x_guess`{held}: they depend on each "
-        f"other there.{advice} Remove equations that follow from others, or start elsewhere.",
+        f"other there.{advice} Remove equations that follow from others, or start elsewhere.{other_form}",
         f"No state near `x_guess` satisfies the equations of `F` and their derivatives{held}.{advice} Start closer, or "
         "check that they can hold at the same time.",
         "The equations of `F` do not determine all derivatives at the start: some depend on the others there "

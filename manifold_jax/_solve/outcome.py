@@ -30,7 +30,8 @@ _TOO_LONG = (
 )
 _NOT_FINITE = (
     "The state is not finite (NaN or infinite) from some time on: the vector field is not defined on the way. For an "
-    "`mj.MechanicalSystem` the mass matrix is not positive definite there, or constraints depend on each other."
+    "`mj.MechanicalSystem` the mass matrix is not positive definite there, or constraints depend on each other; for a "
+    "DAE with algebraic equations these no longer determine the algebraic unknowns."
 )
 _NAN_INSIDE = (
     "The search for an event, or for a stage of an implicit method, met NaN: a function in `event` or `resets` or the "
