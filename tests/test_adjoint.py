@@ -601,3 +601,24 @@ def test_forward_mode_repeats_the_steps_that_were_made():
     # y = exp(rate sin t) is 2 at sin t = log(2) / rate.
     sine = np.log(2) / 1.2
     np.testing.assert_allclose(time, -sine / 1.2 / np.sqrt(1 - sine**2), rtol=1e-5)
+
+
+@pytest.mark.parametrize("checkpoints", [None, 2])
+def test_second_derivative_with_rejected_steps(checkpoints):
+    """Forward over reverse mode: the tangents of the recorded states are those of the same rows."""
+    controller = dfx.PIDController(rtol=1e-5, atol=1e-8)
+
+    def end(p, adjoint):
+        bump = lambda t: 3 * jnp.exp(-200 * (t - 1) ** 2)
+        field = lambda t, y, args: jnp.stack([p * y[1] + bump(t) * y[0] ** 2, -p * y[0]])
+        given = dict(stepsize_controller=controller, max_steps=50, adjoint=adjoint)
+        y0 = jnp.array([1.0, 0.2])
+        sol = mj.diffeqsolve(dfx.ODETerm(field), dfx.Tsit5(), 0.0, 3.0, 0.3, y0, **given)
+        return sol.ys[0, 0], sol.stats["num_rejected_steps"]
+
+    adjoint = mj.StepReplayAdjoint(checkpoints)
+    second = lambda first: jax.jit(jax.jacfwd(first, has_aux=True))(1.3)
+    over_reverse, rejected = second(jax.grad(lambda p: end(p, adjoint), has_aux=True))
+    over_forward, _ = second(jax.jacfwd(lambda p: end(p, dfx.ForwardMode()), has_aux=True))
+    assert rejected > 3
+    np.testing.assert_allclose(over_reverse, over_forward, rtol=1e-11)

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, Bool, Float
 
-from .._base.compat import LoopState, Progress, with_next_time
+from .._base.compat import LoopState, Progress, with_controller_state, with_next_time
 from .._base.types import IntScalar
 from .._linalg.newton import without_derivative
 from .._resets.controller import has_prescribed_times, ResettingController
@@ -38,7 +38,7 @@ class SizesHeldFixed(dfx.AbstractStepSizeController):
 
 
 class MadeSteps(eqx.Module):
-    """The steps of a solve: accepted steps, each after the rejected ones from the same start."""
+    """The steps of a solve, rejected ones included, in their order."""
 
     starts: Float[Array, " steps"]  # infinite after the last step
     ends: Float[Array, " steps"]  # negative infinity for rejected steps
@@ -59,22 +59,16 @@ class MadeSteps(eqx.Module):
         after_jump = columns[2] > 0 if record.jumps else jnp.zeros(len(starts), bool)
         return MadeSteps(starts, columns[1], after_jump)
 
-    def number_until(self, start: Any) -> IntScalar:
-        """Return how many steps begin at a time or before it."""
-        return jnp.searchsorted(self.starts, start, side="right", method="scan_unrolled")
-
-    def last_from(self, start: Any) -> IntScalar:
-        """Return the last step from a start, the one that may have been accepted."""
-        return self.number_until(start) - 1
-
 
 class Choice(NamedTuple):
-    """What a controller chooses after a step; `none_left` where a solve that is repeated made no more."""
+    """What a controller chooses after a step; whether it is that of a solve that was made already, and
+    whether that made no more steps."""
 
     keep: Bool[Array, ""]
     start: Float[Array, ""]
     end: Float[Array, ""]
     after_jump: Bool[Array, ""]
+    repeats: Bool[Array, ""]
     none_left: Bool[Array, ""]
 
 
@@ -87,41 +81,49 @@ def _first_end(own: Any, made: MadeSteps) -> Any:
 @_first_end.defjvp
 def _first_end_made(primals: Any, tangents: Any) -> tuple[Any, Any]:
     own, made = primals
-    end = made.ends[made.last_from(made.starts[0])]
-    return jnp.where(end > -jnp.inf, end, own), jnp.zeros_like(tangents[0])
+    return jnp.where(made.ends[0] > -jnp.inf, made.ends[0], own), jnp.zeros_like(tangents[0])
 
 
 @jax.custom_jvp
-def _choice(own: Choice, step: tuple[Any, Any], made: MadeSteps) -> Choice:
-    """Return the controller's own choice after a step, but in forward mode, which repeats a solve, that of
-    the record.
+def _choice(own: Choice, step: tuple[Any, Any], number: IntScalar, made: MadeSteps) -> Choice:
+    """Return the controller's own choice after the step `number`, but in forward mode, which repeats a solve,
+    that of the record.
 
     The repeated step is rounded differently. Where errors are as small as rounding, the next one would
     have quite another size, while values saved at the ends of steps and events in them are those of
-    the first solve.
+    the first solve. Rejected steps are repeated, too, from which second derivatives know the rows of
+    the record; where such a step ends does not matter.
     """
     return own
 
 
 @_choice.defjvp
 def _choice_made(primals: Any, tangents: Any) -> tuple[Choice, Any]:
-    _, (start, end), made = primals
-    until_now = made.number_until(start)
-    first = made.starts[jnp.minimum(until_now, len(made.starts) - 1)]
-    following = made.last_from(first)
-    none_left = (first <= start) | (first == jnp.inf) | (made.ends[following] == -jnp.inf)
+    own, (t0, t1), number, made = primals
+    keep = made.ends[number] > -jnp.inf
+    following = jnp.minimum(number + 1, len(made.starts) - 1)
+    none_left = (following == number) | (made.starts[following] == jnp.inf)
+    end = jnp.where(made.ends[following] > -jnp.inf, made.ends[following], own.end)
     choice = Choice(
-        made.ends[until_now - 1] > -jnp.inf,
-        jnp.where(none_left, end, first),
-        jnp.where(none_left, end, made.ends[following]),
+        keep,
+        jnp.where(none_left, jnp.where(keep, t1, t0), made.starts[following]),
+        jnp.where(none_left, t1, end),
         made.after_jump[following] & ~none_left,
+        jnp.ones_like(none_left),
         none_left,
     )
     return choice, jtu.tree_map(jnp.zeros_like, tangents[0])
 
 
+class Numbered(eqx.Module):
+    """The state of a controller, and the number of steps so far."""
+
+    inner: Any
+    steps: IntScalar
+
+
 class StepsOfRecord(dfx.AbstractStepSizeController):
-    """Wraps a controller; in forward mode the steps are those that were made."""
+    """Wraps a controller; in forward mode the steps are those that were made. Its state is [`Numbered`][]."""
 
     controller: SizesHeldFixed
     made: MadeSteps
@@ -131,19 +133,40 @@ class StepsOfRecord(dfx.AbstractStepSizeController):
         return eqx.tree_at(lambda c: c.controller, self, self.controller.wrap(direction))
 
     def init(self, *args: Any) -> Any:
-        return self.controller.init(*args)
+        first, inner = self.controller.init(*args)
+        return first, Numbered(inner, jnp.zeros((), jnp.int32))
 
-    def adapt_step_size(self, t0, t1, *step: Any) -> Any:
-        keep, start, end, after_jump, state, result = self.controller.adapt_step_size(t0, t1, *step)
-        own = Choice(*map(jnp.asarray, (keep, start, end, after_jump, False)))
-        choice = _choice(without_derivative(own), lax.stop_gradient((t0, t1)), self.made)
-        start = jnp.where(choice.start == t1, t1, choice.start)
+    def adapt_step_size(self, t0, t1, y0, y1_candidate, args, y_error, error_order, state) -> Any:
+        step = t0, t1, y0, y1_candidate, args, y_error, error_order
+        keep, start, end, after_jump, inner, result = self.controller.adapt_step_size(
+            *step, state.inner
+        )
+        own = Choice(*map(jnp.asarray, (keep, start, end, after_jump, False, False)))
+        own, ends = without_derivative((own, (t0, t1)))
+        choice = _choice(own, ends, state.steps, self.made)
+        start = jnp.where(choice.start == t1, t1, jnp.where(choice.start == t0, t0, choice.start))
         end = jnp.where(choice.end == self.end, self.end, choice.end)
         if after_jump is not False:
             after_jump = choice.after_jump
+        RESULTS = dfx.RESULTS
         unfinished = choice.none_left & (start < self.end)
-        result = dfx.RESULTS.where(unfinished, dfx.RESULTS.max_steps_reached, result)
-        return choice.keep, start, end, after_jump, state, result
+        of_record = RESULTS.where(unfinished, RESULTS.max_steps_reached, RESULTS.successful)
+        result = RESULTS.where(choice.repeats, of_record, result)
+        return choice.keep, start, end, after_jump, Numbered(inner, state.steps + 1), result
+
+
+def numbered(controller: Any, state: LoopState) -> LoopState:
+    """Return the state of a solve before its first step, as this controller needs it."""
+    if not isinstance(controller, StepsOfRecord):
+        return state
+    inner = Progress.of(state).controller_state
+    return with_controller_state(state, Numbered(inner, jnp.zeros((), jnp.int32)))
+
+
+def unnumbered(state: LoopState) -> LoopState:
+    """Return the final state of a solve as Diffrax knows it."""
+    numbered = Progress.of(state).controller_state
+    return with_controller_state(state, numbered.inner) if isinstance(numbered, Numbered) else state
 
 
 def with_steps_held_fixed(

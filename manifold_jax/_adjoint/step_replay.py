@@ -25,6 +25,8 @@ from .events import LocatingAdjoint
 from .fixed_steps import (
     event_of_controller,
     MadeSteps,
+    numbered,
+    unnumbered,
     with_end_held_fixed,
     with_steps_held_fixed,
 )
@@ -118,9 +120,10 @@ class StepReplayAdjoint(dfx.AbstractAdjoint):
         dt0 = nondifferentiable(dt0, msg=_NO_STEP_SIZES)
 
         def run(outer_while_loop, made):
-            return diffrax_loop(
+            controller = with_steps_held_fixed(stepsize_controller, made, t1)
+            final_state, statistics = diffrax_loop(
                 solver=_with_loops(solver, "lax"),
-                stepsize_controller=with_steps_held_fixed(stepsize_controller, made, t1),
+                stepsize_controller=controller,
                 event=event_of_controller(event, stepsize_controller),
                 saveat=saveat,
                 t0=t0,
@@ -129,11 +132,12 @@ class StepReplayAdjoint(dfx.AbstractAdjoint):
                 max_steps=max_steps,
                 terms=terms,
                 args=args,
-                init_state=with_end_held_fixed(init_state, t1, made),
+                init_state=numbered(controller, with_end_held_fixed(init_state, t1, made)),
                 inner_while_loop=_while_loop,
                 outer_while_loop=outer_while_loop,
                 progress_meter=progress_meter,
             )
+            return unnumbered(final_state), statistics
 
         twice = _with_loops(solver, "bounded")
         interpolates = saveat.dense or event is not None

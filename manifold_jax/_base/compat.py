@@ -144,6 +144,11 @@ def with_next_time(state: LoopState, tnext: Any) -> LoopState:
     return eqx.tree_at(lambda s: s.tnext, state, tnext)
 
 
+def with_controller_state(state: LoopState, controller_state: Any) -> LoopState:
+    is_leaf = lambda x: x is None
+    return eqx.tree_at(lambda s: s.controller_state, state, controller_state, is_leaf=is_leaf)
+
+
 class Progress(NamedTuple):
     """The progress of a solve: where its next step begins and ends, from which state, and the
     numbers of steps so far."""
