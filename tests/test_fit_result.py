@@ -242,6 +242,28 @@ def test_standard_errors_do_not_depend_on_units(unit, c, precision):
     np.testing.assert_allclose([k, c / unit], [0.7, 0.5], atol=0.1)
 
 
+def _pressure(t, y, p):
+    return p["ambient"] + y
+
+
+def test_standard_errors_beside_a_large_offset():
+    """A small overpressure decays beside that of the atmosphere, in Pa."""
+    ts, sigma = np.linspace(0.1, 4, 20), 1e-4
+    data = 101325 + 0.05 * np.exp(-0.7 * ts) + sigma * np.random.default_rng(0).normal(size=20)
+    decay = dfx.ODETerm(lambda t, y, p: -p["k"] * y)
+    start, given = {"k": 0.6, "ambient": 101325.1}, dict(y0=jnp.asarray(0.05), t0=0.0, sigma=sigma)
+    controller = dfx.PIDController(rtol=1e-10, atol=1e-14)
+    result = mj.fit(
+        decay, start, ts, data, observe=_pressure, stepsize_controller=controller, **given
+    )
+    k = result.parameters["k"]
+    J = np.stack([-0.05 * ts * np.exp(-k * ts), np.ones_like(ts)], axis=1) / sigma
+    expected = np.sqrt(np.diag(np.linalg.inv(J.T @ J)))
+    errors = result.standard_errors
+    assert result.unidentifiable == ()
+    np.testing.assert_allclose([errors["k"], errors["ambient"]], expected, rtol=1e-5)
+
+
 def test_a_parameter_that_cancels_but_for_rounding_is_not_determined():
     swing = lambda t, y, p: jnp.stack([y[1], -p["mass"] * p["g"] * y[0] / p["mass"]])
     start, truth = {"mass": 3.3, "g": 0.9}, np.stack([np.cos(TS), -np.sin(TS)], axis=1)

@@ -195,7 +195,7 @@ def event_of_controller(
     event: dfx.Event | None, controller: dfx.AbstractStepSizeController
 ) -> dfx.Event | None:
     """Return the event with the original controller, whose tolerances Diffrax's own event functions ask
-    for, instead of the wrapped one."""
+    for, instead of the wrapped one. (`mj.diffeqsolve` tells them by itself, `diffrax.diffeqsolve` not.)"""
     if event is None:
         return None
 

@@ -12,8 +12,7 @@ from .objective import linearize, Objective, Solved, weighted
 
 
 # Derivatives are as accurate as the solver's tolerance: singular values below this fraction of the
-# largest, after scaling columns to length 1, count as zero; and so does an effect on a measured
-# quantity below this fraction of the largest effect on it.
+# largest, after scaling columns to length 1, count as zero.
 _SINGULAR = 1e-6
 
 
@@ -95,18 +94,13 @@ def large_changes(u: Any, objective: Objective) -> np.ndarray:
 
 
 def has_effect(linear: Any, observed: Any, objective: Objective, used: np.ndarray) -> np.ndarray:
-    """Return which unknowns change any prediction or gap by more than the errors of derivatives, `(N,)`.
-
-    Effects are compared for each measured quantity of each piece on its own, without weights: a precise
-    quantity says nothing about what others depend on.
-    """
+    """Return which unknowns change any prediction or gap by more than its rounding, `(N,)`. Weights do not
+    matter: that one quantity is measured precisely says nothing about what others depend on, nor does
+    an offset that is large."""
     weights = np.where(used, np.asarray(objective.pieces.weights), 1.0)
     measured = np.where(used[..., None], linear.J / weights[..., None], 0.0)
     size = np.max(np.abs(np.where(used, np.asarray(observed), 0.0)), axis=1)
-    noticed = lambda effects, rounding: np.any(
-        effects > np.maximum(_SINGULAR * np.max(effects, axis=-1, keepdims=True), rounding),
-        axis=(0, 1),
-    )
+    noticed = lambda effects, rounding: np.any(effects > rounding, axis=(0, 1))
     rounding = 100 * np.finfo(size.dtype).eps * size[..., None]
     of_data = noticed(np.max(np.abs(measured), axis=1), rounding)
     # The state where a gap is has an effect of the size of the state, far above rounding.

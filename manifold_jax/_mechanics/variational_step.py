@@ -114,8 +114,6 @@ def _solve(equations: Callable, guess: Array, sizes: Array) -> tuple[Array, Bool
     root = chord(fixed, linearization, guess, fixed.residual(guess), sizes, _MOST)
     # With masses of a bad condition, as those of a long chain in its angles, rounding leaves more of the
     # residual than elsewhere; it no longer shrinks then.
-    stalled = ~root.progress & (
-        root.scaled_residual <= float(jnp.finfo(guess.dtype).eps) ** (2 / 3)
-    )
+    stalled = ~root.progress & (root.scaled_residual <= float(jnp.finfo(guess.dtype).eps) ** 0.75)
     success = stalled | (root.scaled_residual <= NewtonProjection().tolerance_for(guess.dtype))
     return implicit_root(system, jnp.where(success, root.z, guess)), success

@@ -30,15 +30,14 @@ class TerminatingEvents(eqx.Module):
             jtu.tree_leaves(self.event.direction, is_leaf=lambda x: x is None),
             strict=True,
         )
-        happened = jnp.asarray(
-            False
-        )  # nor does anything in a step that only says what is at its start
+        happened = jnp.asarray(False)
         for condition, direction in each:
             value = lambda t, y, of=condition: jnp.asarray(of(t, y, self.args))
             start = value(step.t0, step.y0)
             ends = value(*before_end), value(step.t1, step.y1)
             inside, at_end = (has_happened(start, end, direction) for end in ends)
             happened |= inside & at_end
+        # A step of negative length only says what is at its start.
         return happened & ~step.is_negative
 
 

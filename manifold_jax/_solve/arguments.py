@@ -1,5 +1,6 @@
 """Checks of the arguments of `mj.diffeqsolve`; messages say what to write instead."""
 
+import math
 import warnings
 from typing import Any, cast
 
@@ -106,6 +107,8 @@ def check_shape_of_tolerances(controller: Any, y0: Y) -> None:
         return
     for name in ("rtol", "atol"):
         shape = jnp.shape(getattr(tolerances, name))
+        if math.prod(shape) == 1:
+            continue
         for leaf in map(jnp.shape, jtu.tree_leaves(y0)):
             if len(shape) > len(leaf) or any(
                 a not in (1, b) for a, b in zip(shape[::-1], leaf[::-1], strict=False)
@@ -175,8 +178,13 @@ def with_positive_tolerance(controller: Any, y0: Y) -> Any:
     with jax.numpy_dtype_promotion("standard"):
         dtypes = [jnp.result_type(float, leaf) for leaf in jtu.tree_leaves(y0)]
     smallest = max((float(jnp.finfo(dtype).tiny) for dtype in dtypes), default=0.0)
-    larger = max if isinstance(tolerances.atol, int | float) else jnp.maximum
-    atol = larger(tolerances.atol, smallest)
+    atol = tolerances.atol
+    if isinstance(atol, int | float):
+        if atol >= smallest:
+            return controller
+        atol = smallest
+    else:
+        atol = jnp.maximum(jnp.asarray(atol, jnp.result_type(float)), smallest)
     found = lambda controller: cast(Any, controller_tolerances(controller)).atol
     return eqx.tree_at(found, controller, atol)
 

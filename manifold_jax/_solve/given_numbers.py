@@ -73,14 +73,14 @@ def _check_tolerances(controller: Any) -> None:
         value = getattr(tolerances, name)
         _check_real(f"`{name}` of `stepsize_controller`", value)
         if isinstance(value, jax.core.Tracer):
-            return
+            continue
         values.append(np.asarray(value))
         if not np.all(values[-1] >= 0):
             raise ValueError(
                 f"`{name}` of `stepsize_controller` must not be negative or NaN, got {value}. Write e.g. "
                 "`diffrax.PIDController(rtol=1e-6, atol=1e-6)`."
             )
-    if values[0].ndim == 0 and np.any(values[0] + values[1] == 0):
+    if len(values) == 2 and values[0].ndim == 0 and np.any(values[0] + values[1] == 0):
         raise ValueError(
             "`rtol` and `atol` of `stepsize_controller` are both zero: no step is that accurate. Write e.g. "
             "`diffrax.PIDController(rtol=1e-6, atol=1e-6)`."
