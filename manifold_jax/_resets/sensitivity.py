@@ -14,9 +14,18 @@ from .samples import SearchedStep
 
 
 _PERTURBATIONS = 4
-# Changes of a condition up to so many units of its rounding are taken from its rate of change; in a long
-# step from the rates at its start and this part of it later.
-_MOST, _SOON = 1e3, 1e-6
+
+
+def _most(dtype: Any) -> float:
+    """Return up to how many units of its rounding a change of a condition is taken from its rate of change:
+    where the error of that, of third order, is about as large as rounding."""
+    return float(jnp.finfo(dtype).eps) ** -0.2
+
+
+def _soon(dtype: Any) -> float:
+    """Return after which part of a long step rates of change are compared with those at its start, such that
+    rounding spoils the difference as little as curvature does."""
+    return float(jnp.finfo(dtype).eps) ** 0.375
 
 
 class Sensitivity(NamedTuple):
@@ -36,8 +45,8 @@ class Sensitivity(NamedTuple):
     ) -> "Sensitivity":
         start, end = (step.t0, step.y0), (step.t1, step.y1)
         moving = lambda t, y: (jnp.ones_like(t), step.field(t, y))
-        motion = moving(*start)
-        ahead = lambda x, dx: x + (_SOON * step.length * dx).astype(x.dtype)
+        motion, soon_after = moving(*start), _soon(step.t0.dtype)
+        ahead = lambda x, dx: x + (soon_after * step.length * dx).astype(x.dtype)
         soon = jtu.tree_map(ahead, start, motion)
         later = jax.vmap(moving)(*jtu.tree_map(lambda *x: jnp.stack(x), soon, end))
         motions = jtu.tree_map(lambda x, xs: jnp.concatenate([x[None], xs]), motion, later)
@@ -63,13 +72,14 @@ class Sensitivity(NamedTuple):
         `largest` are the largest absolute values in the step. While they are small, the rate of change is
         as good as linear in time.
         """
-        is_step_short = largest <= _MOST * self.noise
+        most = _most(length.dtype)
+        is_step_short = largest <= most * self.noise
         later = jnp.where(is_step_short, self.at_end, self.soon)
-        time = jnp.where(is_step_short, length, _SOON * length)
+        time = jnp.where(is_step_short, length, _soon(length.dtype) * length)
         slows = self.rate * (later - self.rate) < 0
         time = 2 * self.rate * time / jnp.where(slows, self.rate - later, 1)
         hop = jnp.where(slows, time, jnp.inf)
-        return hop, jnp.abs(self.rate) * hop <= _MOST * self.noise
+        return hop, jnp.abs(self.rate) * hop <= most * self.noise
 
 
 def _uncertainty(velocity: Array) -> Array:
