@@ -121,6 +121,10 @@ class Numbered(eqx.Module):
     inner: Any
     steps: IntScalar
 
+    @staticmethod
+    def first(inner: Any) -> "Numbered":
+        return Numbered(inner, jnp.zeros((), jnp.int32))
+
 
 class StepsOfRecord(dfx.AbstractStepSizeController):
     """Wraps a controller; in forward mode the steps are those that were made. Its state is [`Numbered`][]."""
@@ -134,7 +138,7 @@ class StepsOfRecord(dfx.AbstractStepSizeController):
 
     def init(self, *args: Any) -> Any:
         first, inner = self.controller.init(*args)
-        return first, Numbered(inner, jnp.zeros((), jnp.int32))
+        return first, Numbered.first(inner)
 
     def adapt_step_size(self, t0, t1, y0, y1_candidate, args, y_error, error_order, state) -> Any:
         step = t0, t1, y0, y1_candidate, args, y_error, error_order
@@ -160,7 +164,7 @@ def numbered(controller: Any, state: LoopState) -> LoopState:
     if not isinstance(controller, StepsOfRecord):
         return state
     inner = Progress.of(state).controller_state
-    return with_controller_state(state, Numbered(inner, jnp.zeros((), jnp.int32)))
+    return with_controller_state(state, Numbered.first(inner))
 
 
 def unnumbered(state: LoopState) -> LoopState:
