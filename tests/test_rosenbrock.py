@@ -685,6 +685,11 @@ def test_hooks_that_need_the_derivative(hook):
         mj.diffeqsolve(mj.MassMatrixTerm(pendulum, PENDULUM_MASS), solver, 0.0, 0.1, 0.05, y0)
 
 
+def controlled(counts):
+    terms = mj.MassMatrixTerm(index_one, jnp.array([1.0, 0.0]), controlled=counts)
+    return mj.diffeqsolve(terms, mj.Rodas5P(), 0.0, 1.0, 0.1, START)
+
+
 @pytest.mark.parametrize(
     ("call", "error", "message"),
     [
@@ -694,6 +699,10 @@ def test_hooks_that_need_the_derivative(hook):
         (lambda: mj.MassMatrixTerm(index_one, "M"), TypeError, "`mass`"),
         (lambda: mj.MassMatrixTerm(index_one, lambda y: y), TypeError, r"M\(t, y, args\)"),
         (lambda: mj.MassMatrixTerm(1.0, 1.0), TypeError, "`vector_field`"),
+        (lambda: controlled(np.ones(2)), ValueError, "`controlled` must be a vector of booleans"),
+        (lambda: controlled(np.zeros(2, bool)), ValueError, "some of them true"),
+        (lambda: controlled(jnp.ones(3, bool)), ValueError, r"`controlled` must have shape \(2,\)"),
+        (lambda: jax.jit(controlled)(jnp.ones(2, bool)), TypeError, "use NumPy"),
         (lambda: solve_dae(START, lambda t, y, a: y[:1]), ValueError, "`vector_field`"),
         (lambda: solve_dae(jnp.array([1j, 0])), TypeError, "complex"),
         (lambda: solve_dae(jnp.array([1, 0])), TypeError, "int"),

@@ -145,7 +145,8 @@ class RadauIIA5(AbstractMassMatrixSolver, dfx.AbstractImplicitSolver):
         step = without_derivative(self._solve(fixed, state, derivative))
         newton_step = StageEquations(system, x0).newton_step
         Z = root_of_step(convert_closure(newton_step, step.Z), step.Z)
-        attempted = AttemptedStep(x0 + Z[2], step.error, step.defined, step.solved)
+        error = system.controlled(step.error)
+        attempted = AttemptedStep(x0 + Z[2], error, step.defined, step.solved)
         y1, error, result = attempted.outcome(t0, t1, state, unravel)
         k1, k2 = constant(DENSE, Z) @ Z
         dense_info = dict(y0=y0, y1=y1, k=(unravel(k1), unravel(k2)))
@@ -160,7 +161,10 @@ class RadauIIA5(AbstractMassMatrixSolver, dfx.AbstractImplicitSolver):
         newton = equations.at_start(V0)
         unravel = jfu.ravel_pytree(equations.system.y0)[1]
         size = lambda dx, z: size_in_tolerances(
-            self.root_finder, unravel(dx), unravel(x0), unravel(x0 + z)
+            self.root_finder,
+            unravel(equations.system.controlled(dx)),
+            unravel(x0),
+            unravel(x0 + z),
         )
         unit = 8 * jnp.finfo(x0.dtype).eps
         Z, solved = solve_stages(

@@ -45,6 +45,9 @@ class MassMatrixTerm(dfx.AbstractTerm):
         the `n` numbers of `y` in the order of `jax.flatten_util.ravel_pytree`. Of constant rank, or of one that
         changes at times which the controller knows (`jump_ts` of `diffrax.ClipStepSizeController`). Where
         a mass passes through zero solutions are in general not unique beyond, and nothing says so.
+    - `controlled`: which of the `n` numbers of `y` count in the error of a step and in that of the stages of
+        [`RadauIIA5`][], booleans of shape `(n,)`; all by default. Leave out auxiliary unknowns, such as
+        derivatives of others: these may be large between zeros at which no relative tolerance can be met.
 
     The initial value has to satisfy the algebraic equations. [`mj.diffeqsolve`][] sees to that
     (`consistent="project"` changes only what `M` does not see, `"check"` refuses); with
@@ -53,7 +56,7 @@ class MassMatrixTerm(dfx.AbstractTerm):
 
     **Raises:**
 
-    `TypeError` and `ValueError` for masses of another kind or shape.
+    `TypeError` and `ValueError` for masses or `controlled` of another kind or shape.
 
     Source: Hairer & Wanner, Solving ODEs II, chapter VI (index 1), VI.6 for masses that depend on
     the state.
@@ -63,8 +66,15 @@ class MassMatrixTerm(dfx.AbstractTerm):
     mass: Any
     # Which numbers of a diagonal are zero, packed, if that was known outside of compiled programs.
     packed_massless: bytes | None = eqx.field(static=True)
+    packed_controlled: bytes | None = eqx.field(static=True)
 
-    def __init__(self, vector_field: Callable[[RealScalarLike, Y, Args], Y], mass: Any):
+    def __init__(
+        self,
+        vector_field: Callable[[RealScalarLike, Y, Args], Y],
+        mass: Any,
+        *,
+        controlled: np.ndarray | None = None,
+    ):
         check_function("vector_field", vector_field, "f(t, y, args)")
         if callable(mass):
             check_function("mass", mass, "M(t, y, args)")
@@ -73,6 +83,7 @@ class MassMatrixTerm(dfx.AbstractTerm):
         self.vector_field = vector_field
         self.mass = mass
         self.packed_massless = _packed_massless(mass)
+        self.packed_controlled = None if controlled is None else _packed_controlled(controlled)
 
     def vf(self, t: RealScalarLike, y: Y, args: Args) -> Y:
         return self.vector_field(t, y, args)
@@ -128,10 +139,19 @@ class MassMatrixTerm(dfx.AbstractTerm):
         """Return which of the `n` numbers on the diagonal are zero, `None` if that is not known."""
         if self.packed_massless is None:
             return None
-        surplus, packed = self.packed_massless[0], self.packed_massless[1:]
-        bits = np.unpackbits(np.frombuffer(packed, np.uint8), count=8 * len(packed) - surplus)
-        known = bits.astype(bool)
+        known = _unpacked(self.packed_massless)
         return np.broadcast_to(known, (n,)) if known.size in (1, n) else None
+
+    def controlled(self, error: Float[Array, " n"]) -> Float[Array, " n"]:
+        """Return the error of a step, zero where it does not count."""
+        if self.packed_controlled is None:
+            return error
+        counts = _unpacked(self.packed_controlled)
+        if counts.shape != error.shape:
+            raise ValueError(
+                f"`controlled` must have shape ({error.size},), a boolean for each number of y, got {counts.shape}."
+            )
+        return jnp.where(counts, error, 0)
 
 
 def _packed_massless(mass: Any) -> bytes | None:
@@ -141,8 +161,31 @@ def _packed_massless(mass: Any) -> bytes | None:
     is_matrix = len(leaves) == 1 and leaves[0] is mass and np.ndim(mass) == 2
     if callable(mass) or is_matrix or any(isinstance(x, jax.core.Tracer) for x in leaves):
         return None
-    zero = np.concatenate([np.ravel(np.asarray(leaf)) == 0 for leaf in leaves])
-    return bytes([-zero.size % 8]) + np.packbits(zero).tobytes()
+    return _packed(np.concatenate([np.ravel(np.asarray(leaf)) == 0 for leaf in leaves]))
+
+
+def _packed_controlled(controlled: Any) -> bytes:
+    if isinstance(controlled, jax.core.Tracer):
+        raise TypeError(
+            "`controlled` must be known outside of compiled programs: use NumPy for it."
+        )
+    counts = np.asarray(controlled)
+    if counts.dtype != bool or counts.ndim != 1 or not counts.any():
+        raise ValueError(
+            "`controlled` must be a vector of booleans, some of them true, one for each number of y, got "
+            f"{counts.dtype} of shape {counts.shape}."
+        )
+    return _packed(counts)
+
+
+def _packed(bits: np.ndarray) -> bytes:
+    return bytes([-bits.size % 8]) + np.packbits(bits).tobytes()
+
+
+def _unpacked(known: bytes) -> np.ndarray:
+    surplus, packed = known[0], known[1:]
+    bits = np.unpackbits(np.frombuffer(packed, np.uint8), count=8 * len(packed) - surplus)
+    return bits.astype(bool)
 
 
 @clear_errors

@@ -103,7 +103,8 @@ class AbstractRosenbrock(AbstractMassMatrixSolver):
         step = rosenbrock_step(
             self.tableau, system, x0, derivative, self.structure, self.largest_written_out
         )
-        attempted = AttemptedStep(step.x1, step.error, step.defined, step.nonsingular)
+        error = system.controlled(step.error)
+        attempted = AttemptedStep(step.x1, error, step.defined, step.nonsingular)
         y1, error, result = attempted.outcome(t0, t1, solver_state, unravel)
         dense_info = dict(y0=y0, y1=y1, k=tuple(unravel(k) for k in step.dense))
         state = RosenbrockState(solver_state.first_step, step.derivative, solver_state.usable)
