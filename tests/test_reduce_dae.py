@@ -605,6 +605,7 @@ def test_report(reduced):
         lines[0]
         == "index 3, 2 degrees of freedom: 5 equations reduced to 4 states with 2 constraints"
     )
+    assert repr(reduced("pendulum")) == f"ReducedDAE({lines[0]}; see `report`)"
     assert lines[2].split() == ["x[0]", "x[1]", "x[2]", "x[3]", "x[4]", "c"]
     assert lines[7].split() == ["F[4]", "0", "0", ".", ".", ".", "2"]
     assert lines[8].split() == ["d", "2", "2", "1", "1", "0"]

@@ -29,6 +29,10 @@ class ReducedDAE(eqx.Module):
     system: Reduced
     report: DAEReport = eqx.field(static=True)
 
+    def __repr__(self) -> str:
+        summary, *_ = str(self.report).splitlines()
+        return f"ReducedDAE({summary}; see `report`)"
+
     @property
     def terms(self) -> dfx.ODETerm | MassMatrixTerm:
         """The vector field on the state, a Diffrax term; NaN where the equations do not determine it.
