@@ -335,7 +335,8 @@ def test_hessian_vector_product(hook, solver):
 
 
 def test_stochastic():
-    """Brownian motion is a function of time, and the same in the reverse sweep."""
+    """Brownian motion is a function of time, and the same in the reverse sweep. It refuses derivatives
+    with respect to times, also those that are zero."""
     problem = mj.problems.sphere_flow()
     noise = dfx.VirtualBrownianTree(0.0, 1.0, 1e-3, (), jax.random.key(0))
 
@@ -356,9 +357,15 @@ def test_stochastic():
         )
         return sol.ys[0] @ jnp.arange(1.0, 1 + problem.y0.size)
 
-    reverse = jax.jit(jax.grad(lambda scale: end(scale, mj.StepReplayAdjoint())))(1.0)
-    forward = jax.jit(jax.jacfwd(lambda scale: end(scale, dfx.ForwardMode())))(1.0)
-    np.testing.assert_allclose(reverse, forward, rtol=1e-11)
+    replayed = lambda scale: end(scale, mj.StepReplayAdjoint())
+    by_diffrax = lambda scale: end(scale, dfx.ForwardMode())
+    forwards = jax.jit(lambda scale: [jax.jacfwd(f)(scale) for f in (by_diffrax, replayed)])
+    twice = jax.jit(lambda scale: jax.jvp(jax.grad(replayed), (scale,), (1.0,)))
+    expected, repeated = forwards(1.0)
+    reverse, second = twice(1.0)
+    np.testing.assert_allclose([reverse, repeated], expected, rtol=1e-11)
+    difference = (twice(1 + 1e-4)[0] - twice(1 - 1e-4)[0]) / 2e-4
+    np.testing.assert_allclose(second, difference, rtol=1e-6)
 
 
 def released(theta, t0=0.0, t1=1.0, **options):

@@ -147,7 +147,8 @@ class StepsOfRecord(dfx.AbstractStepSizeController):
         )
         own = Choice(*map(jnp.asarray, (keep, start, end, after_jump, False, False)))
         own, ends = without_derivative((own, (t0, t1)))
-        choice = _choice(own, ends, state.steps, self.made)
+        # Not zero derivatives but none: a Brownian motion refuses any with respect to its times.
+        choice = without_derivative(_choice(own, ends, state.steps, self.made))
         start = jnp.where(choice.start == t1, t1, jnp.where(choice.start == t0, t0, choice.start))
         end = jnp.where(choice.end == self.end, self.end, choice.end)
         if after_jump is not False:
@@ -191,7 +192,7 @@ def with_steps_held_fixed(
 def with_end_held_fixed(state: LoopState, t1: Any, made: MadeSteps | None) -> LoopState:
     """Hold the end of the first step fixed, unless it is the end of the solve."""
     tnext = lax.stop_gradient(Progress.of(state).tnext)
-    first = tnext if made is None else _first_end(tnext, made)
+    first = tnext if made is None else without_derivative(_first_end(tnext, made))
     return with_next_time(state, jnp.where(first == t1, t1, first))
 
 

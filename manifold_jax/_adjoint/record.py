@@ -105,6 +105,7 @@ class Record(eqx.Module):
     sizes: Sizes = eqx.field(static=True)
     jumps: bool = eqx.field(static=True)  # whether steps may begin after jumps of the field
     resets: bool = eqx.field(static=True)  # whether steps may end at a reset
+    noise: bool = eqx.field(static=True)  # which has no derivatives with respect to times
 
     @staticmethod
     def empty(
@@ -114,6 +115,7 @@ class Record(eqx.Module):
         checkpoints: int | None,
         jumps: bool,
         resets: bool,
+        noise: bool,
     ) -> "Record":
         """Return a record without steps. Its columns are the start and the end of a step, whether it begins
         after a jump of the field, and twice the number of the reset at its end (-1 for none), one more if it
@@ -126,7 +128,7 @@ class Record(eqx.Module):
         kept = {k: room((sizes.kept, sizes.block), v) for k, v in x.items() if sizes.kept}
         times = jnp.full((sizes.blocks, sizes.block, 2 + jumps + resets), -jnp.inf, time_dtype)
         firsts = {k: room((segments,), v) for k, v in x.items() if segments}
-        return Record(times, kept, firsts, packing, sizes, jumps, resets)
+        return Record(times, kept, firsts, packing, sizes, jumps, resets, noise)
 
     def including(self, i: IntScalar, row: Float[Array, " columns"], x: Vectors) -> "Record":
         """Return the record with step number `i`, made from `x`."""
@@ -138,7 +140,8 @@ class Record(eqx.Module):
         is_kept = block < sizes.kept
         states = {k: buffer_at_set(b, at, x[k], pred=is_kept) for k, b in self.states.items()}  # pyright: ignore[reportArgumentType]
         times = buffer_at_set(self.times, (block, within), row)
-        return Record(times, states, firsts, self.packing, sizes, self.jumps, self.resets)  # pyright: ignore[reportArgumentType]
+        kinds = self.jumps, self.resets, self.noise
+        return Record(times, states, firsts, self.packing, sizes, *kinds)  # pyright: ignore[reportArgumentType]
 
 
 def counted_down(count: IntScalar, through: Callable, carry: Any) -> Any:

@@ -84,6 +84,8 @@ class ReverseSweep(eqx.Module):
         # Rows that are not of an accepted step hold a step of length zero from the first state:
         # functions may refuse anything that is not a state or a time.
         start, end = (jnp.where(accepted, times[..., i], self.ends.t0) for i in range(2))
+        if record.noise:
+            start, end = lax.stop_gradient((start, end))
         jumped = accepted & (times[..., 2] > 0) if record.jumps else None
         reset = begins_at_reset = None
         if record.resets:

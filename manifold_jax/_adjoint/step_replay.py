@@ -11,6 +11,7 @@ from .._base.closure import convert_closure
 from .._base.compat import (
     Differentiable,
     diffrax_loop,
+    is_sde,
     is_unsafe_sde,
     nondifferentiable,
     nondifferentiable_backward,
@@ -149,7 +150,7 @@ class StepReplayAdjoint(dfx.AbstractAdjoint):
         record = made = None
         if max_steps is not None:
             room = max(max_steps, 1), self.checkpoints
-            kinds = solve.jumps, solve.resetting is not None
+            kinds = solve.jumps, solve.resetting is not None, is_sde(terms)
             record = Record.empty(start, Progress.of(init_state).tprev.dtype, *room, *kinds)
             made = MadeSteps.none(record)
 
