@@ -197,7 +197,7 @@ BAD = {
         ys=jnp.array([[1.0, 0.0], [0.8, 0.6], [-0.6, 0.8]])
     ),
     "`state_weights` must not be negative": dict(state_weights=-1.0),
-    "Riccati equation is not finite from t = 1": dict(state_weights=1e300, input_weights=1e-300),
+    "Riccati equation cannot be solved from t = 1": dict(state_weights=1e300, input_weights=1e-300),
 }
 
 

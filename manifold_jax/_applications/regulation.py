@@ -16,6 +16,7 @@ from .._base.types import RealScalarLike, Y
 from .._constraint.checks import as_constraint, check_state
 from .._constraint.constraint import AbstractConstraint
 from .linearization import linearize
+from .riccati import solve_riccati
 
 
 # The cosine of the largest angle between neighbouring tangent spaces.
@@ -33,8 +34,8 @@ _NO_EFFECT = (
     "`mb.Assembly(..., [mb.Controller(joints, lambda t, y, args: args)])`."
 )
 _DIVERGED = (
-    "The Riccati equation is not finite from t = {t:.6g} on backwards. Give more times: the linearized motion should change by no "
-    "more than some ten times from one to the next."
+    "The Riccati equation cannot be solved from t = {t:.6g} on backwards: until the next time an unstable motion without cost "
+    "grows too much, or the weights are too far apart. Give it `state_weights`, or more times."
 )
 
 
@@ -118,17 +119,19 @@ def regulate(
     - `input_weights`: `R`, a positive number, `(m,)`, or `(m, m)`.
 
     **Returns:** a [`Regulator`][]. `A`, `B` and `Q` are means over each interval, for which the Riccati equation
-    is solved exactly: the error is of second order in the distance of the times, and none in a state of rest.
+    is solved exactly: the error is of second order in the distance of the times, and none in a state of rest,
+    however long the interval is and however fast the free motion grows in it.
 
     **Raises** `ValueError` for shapes that do not fit, `R` that is not positive, inputs without any effect,
-    tangent spaces that turn too far between two times, and equations that depend on each other. Inside `jit`
-    the gains are NaN where these are found from the numbers.
+    tangent spaces that turn too far between two times, equations that depend on each other, and unstable
+    motions without cost that grow too much between two times. Inside `jit` the gains are NaN where these are
+    found from the numbers.
 
     Feedback from far away, where the linearization does not hold, is another matter: find a new trajectory.
 
-    Source: Anderson & Moore, Optimal Control: Linear Quadratic Methods (1990), ch. 2-3; Davison & Maki, IEEE
-    Trans. Autom. Control 18 (1973) 71-73 (Riccati equations by exponentials); Posa, Kuindersma & Tedrake, ICRA
-    2016, 1366-1373 (on the tangent space of constraints).
+    Source: Anderson & Moore, Optimal Control: Linear Quadratic Methods (1990), ch. 2-3; Anderson, Int. J.
+    Control 28 (1978) 295-306 (Riccati equations by doubling); Posa, Kuindersma & Tedrake, ICRA 2016, 1366-1373
+    (on the tangent space of constraints).
     """
     constraint = as_constraint(constraint, "regulate(terms, constraint, ts, ys, inputs)")
     ts, ys, inputs = _checked_trajectory(ts, ys, inputs)
@@ -155,7 +158,8 @@ def _regulate(
     T, turns, cosines = _aligned(near.basis)
     A = jax.vmap(lambda turn, A: turn.T @ A @ turn)(turns, near.matrix)
     B = jax.vmap(lambda turn, B: turn.T @ B)(turns, near.by_args)
-    S = _riccati(ts, A, B, jax.vmap(lambda T: T.T @ Q @ T)(T), R, T[-1].T @ final @ T[-1])
+    push = jax.vmap(lambda B: B @ jnp.linalg.solve(R, B.T))(B)
+    S = solve_riccati(ts, A, push, jax.vmap(lambda T: T.T @ Q @ T)(T), T[-1].T @ final @ T[-1])
     gains = jax.vmap(lambda T, S, B: jnp.linalg.solve(R, (T @ S @ B).T))(T, S, B)
     gains = jnp.where(jnp.min(cosines) > _TURNED, gains, jnp.nan)
     rates = jax.vmap(lambda t, y, u: jfu.ravel_pytree(terms.vf(t, y, u))[0])(ts, ys, inputs)
@@ -174,31 +178,6 @@ def _aligned(
         return basis @ turn, (basis @ turn, turn, jnp.min(cosines, initial=1))
 
     return jax.lax.scan(turned, bases[0], bases)[1]
-
-
-def _riccati(
-    ts: Float[Array, " K"],
-    A: Float[Array, "K d d"],
-    B: Float[Array, "K d m"],
-    Q: Float[Array, "K d d"],
-    R: Float[Array, "m m"],
-    final: Float[Array, "d d"],
-) -> Float[Array, "K d d"]:
-    """Solve the Riccati equation backwards: `S = Y X^-1`, where `(X, Y)` solve a linear (Hamiltonian)
-    system, whose matrix is the mean over each interval."""
-    push = jax.vmap(lambda B: B @ jnp.linalg.solve(R, B.T))(B)
-    H = jnp.block([[A, -push], [-Q, -jnp.swapaxes(A, 1, 2)]])
-    steps = jnp.diff(ts)[:, None, None] * (H[1:] + H[:-1]) / 2
-    d = final.shape[0]
-
-    def back(S: Array, flow: Array) -> tuple[Array, Array]:
-        X, Y = jnp.split(flow @ jnp.concatenate([jnp.eye(d, dtype=S.dtype), S]), 2)
-        S = jnp.linalg.solve(X.T, Y.T)
-        S = (S + S.T) / 2
-        return S, S
-
-    _, S = jax.lax.scan(back, final, jax.vmap(jax.scipy.linalg.expm)(-steps), reverse=True)
-    return jnp.concatenate([S, final[None]])
 
 
 def _checked_trajectory(ts: Any, ys: Any, inputs: Any) -> tuple[Array, Y, Array]:
