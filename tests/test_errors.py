@@ -20,13 +20,26 @@ START = jnp.array([1.0, 0.0])
 MESSAGE = "check that the equations can hold at the same time."
 
 
-@pytest.mark.parametrize("function", [mj.consistent_state, mj.project])
-def test_the_message_is_the_beginning_and_the_end(function):
+SLOPE = mj.MechanicalSystem(
+    1.0, lambda t, q, args: q[0] - q[1], lambda t, q, v, args: jnp.array([0.0, -9.81])
+)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: mj.consistent_state(NOWHERE, 0.0, START), MESSAGE),
+        (lambda: mj.project(NOWHERE, 0.0, START), MESSAGE),
+        (lambda: mj.equilibrium(SLOPE, START), "cannot be found."),
+    ],
+    ids=["consistent_state", "project", "equilibrium"],
+)
+def test_the_message_is_the_beginning_and_the_end(call, message):
     with pytest.raises(RuntimeError) as error:
-        function(NOWHERE, 0.0, START)
+        call()
     first, *_, last = str(error.value).splitlines()
     assert first == last
-    assert first.endswith(MESSAGE)
+    assert first.endswith(message)
     assert "EQX_ON_ERROR" not in str(error.value)
 
 

@@ -10,6 +10,7 @@ import jax.tree_util as jtu
 import optimistix as optx
 from jaxtyping import Array, Float
 
+from .._base.errors import clear_errors
 from .._base.numbers import numbers_as_arrays
 from .._base.types import Args, RealScalarLike, Y
 from .system import MechanicalSystem
@@ -30,6 +31,7 @@ class Equilibrium(NamedTuple):
     multipliers: Float[Array, " m"]
 
 
+@clear_errors
 @numbers_as_arrays("args", times=("t",))
 @eqx.filter_jit
 def equilibrium(
