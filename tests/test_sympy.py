@@ -216,6 +216,21 @@ def test_expressions_are_functions(disc):
         model.function(heading.diff())
 
 
+def test_special_functions_and_their_derivatives():
+    """Against `mpmath`."""
+    x = me.dynamicsymbols("x")
+    method = me.LagrangesMethod(x.diff() ** 2 / 2 - sm.erf(x), [x])
+    method.form_lagranges_equations()
+    model, y = mj.from_sympy(method), (np.array([0.7]), np.zeros(1))
+    assert_close(model.terms.vf(0.0, y, {})[1], [-2 / np.sqrt(np.pi) * np.exp(-0.49)])
+    functions = [sm.erf, sm.erfc, sm.erfinv, sm.gamma, sm.loggamma, sm.factorial, sm.Ei]
+    values = [f(x) for f in functions] + [f(x).diff(x) for f in functions]
+    expected = [float(value.subs(x, sm.Float("0.7", 30)).evalf()) for value in values]
+    assert_close(model.function(sm.Matrix(values))(0.0, y, {}), expected)
+    with refused(ValueError, "contain `besselj`, `zeta`, for which there is no function of JAX"):
+        model.function(sm.besselj(0, x) + sm.zeta(x))
+
+
 def test_single_precision_stays_single(disc):
     model, gallery = disc
     y = jax.tree.map(jnp.float32, (jnp.arange(4.0), jnp.arange(4.0)))

@@ -1,5 +1,7 @@
 """Expressions of SymPy as functions of JAX."""
 
+import builtins
+import dis
 import math
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -7,10 +9,25 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import jax.scipy.special as jsp
 
+from .._base.errors import listed
 from .._base.shapes import shapes
 from .._base.types import Args, RealScalarLike, Y
 from .equations import entries_of, name_of, Symbols
+
+
+# By the names of SymPy, which would take those of `math` for some. Derivatives contain `polygamma`.
+_SPECIAL = {
+    "Ei": jsp.expi,
+    "erf": jsp.erf,
+    "erfc": jsp.erfc,
+    "erfinv": jsp.erfinv,
+    "factorial": jsp.factorial,
+    "gamma": jsp.gamma,
+    "loggamma": jsp.gammaln,
+    "polygamma": jsp.polygamma,
+}
 
 
 class SymbolicFunction(eqx.Module):
@@ -116,8 +133,22 @@ def _lambdified(parts: tuple[Any, ...], symbols: Symbols, states: tuple[Any, ...
     shared, entries = sympy.cse(entries, order="none", list=False)
     time, *rest = [[renamed[symbol] for symbol in group] for group in groups]
     done = lambda _: (shared, entries)
-    function = sympy.lambdify([*time, *rest], entries, modules="jax", cse=done)  # pyright: ignore[reportArgumentType]
+    modules = [_SPECIAL, "jax"]
+    function = sympy.lambdify([*time, *rest], entries, modules=modules, cse=done)  # pyright: ignore[reportArgumentType]
+    _check_names(function)
     return jax.jit(function)  # traced once: a solve calls it forty times
+
+
+def _check_names(function: Any) -> None:
+    """Refuse names that nothing defines: functions that SymPy cannot write in JAX it writes as they are."""
+    used = {x.argval for x in dis.get_instructions(function) if x.opname == "LOAD_GLOBAL"}
+    missing = sorted(used - function.__globals__.keys() - vars(builtins).keys())
+    if missing:
+        raise ValueError(
+            f"The expressions contain {listed(missing)}, for which there is no function of JAX. Rewrite the expression, for instance "
+            "by its method `doit` or `rewrite`, or write `f = dynamicsymbols('f')` instead and give "
+            "`inputs={f: lambda t, y, args: ...}`, a function of JAX."
+        )
 
 
 def _replaced(expression: Any, known: dict[Any, Any]) -> Any:
