@@ -257,6 +257,18 @@ def test_one_state_where_an_ensemble_has_many():
     )
 
 
+def test_arguments_of_an_ensemble_without_axes():
+    """Their rows are taken for those of one trajectory; of a leaf with another number of rows nothing is said."""
+    terms = dfx.ODETerm(lambda t, y, args: -args["rate"] * args["size"][0] * y)
+    args = {"rate": jnp.ones(3), "size": jnp.ones(2)}
+    given = terms, dfx.Bosh3(), 0.0, 1.0, 0.1
+    with pytest.raises(ValueError, match=r"returns \(3,\).*of `args\['rate'\]`: if.*`args_axes=0`"):
+        mj.solve_ensemble(*given, jnp.ones((3, 1)), args)
+    with pytest.raises(ValueError, match="must be like the state") as error:
+        mj.solve_ensemble(*given, jnp.ones((4, 1)), args)
+    assert "args_axes" not in str(error.value)
+
+
 @pytest.mark.parametrize("max_steps", [100.0, 0, -3, "many"])
 def test_numbers_of_steps(max_steps):
     for solver in (PROJECTED, dfx.Heun()):

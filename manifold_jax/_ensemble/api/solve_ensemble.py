@@ -124,7 +124,10 @@ def solve_ensemble(
     if not isinstance(max_steps, int) or max_steps < 1:
         raise ValueError(f"`max_steps` must be a positive integer, got {max_steps!r}.")
     one = jax.eval_shape(batch.one)
-    check_field(terms, one.t0, one.y0, one.args)
+    try:
+        check_field(terms, one.t0, one.y0, one.args)
+    except ValueError as error:
+        raise ValueError(f"{error}{_common_rows(batch)}") from None
     check_shape_of_tolerances(stepsize_controller, one.y0)
     warn_of_rounding(one.y0, batch.dtype, stepsize_controller)
     solver = without_idle_hook(solver, one.t0, one.y0, one.args)
@@ -168,5 +171,21 @@ def _example(batch: Batch) -> str:
     one = jax.eval_shape(batch.one)
     return (
         f"Of the {batch.size} trajectories of `y0s` each has a state of shapes {jtu.tree_map(jnp.shape, one.y0)}: the "
-        "leading axes are the trajectories. One alone is solved by `mj.diffeqsolve`."
+        f"leading axes are the trajectories. One alone is solved by `mj.diffeqsolve`.{_common_rows(batch)}"
+    )
+
+
+def _common_rows(batch: Batch) -> str:
+    """Name what is common to all trajectories although it has as many rows as there are trajectories."""
+    leaves = jtu.tree_leaves_with_path(batch.common.args)
+    found = [
+        f"`args{jtu.keystr(path)}`"
+        for path, x in leaves
+        if getattr(x, "shape", ())[:1] == (batch.size,)
+    ]
+    if not found:
+        return ""
+    return (
+        f" All {batch.size} trajectories get the whole of {', '.join(found[:5])}: if it has one row for each of them, mark it "
+        "by 0 in `args_axes`, such as `args_axes=0`."
     )
