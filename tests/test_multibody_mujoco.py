@@ -347,6 +347,31 @@ def test_actuators_of_a_group_that_is_switched_off():
     assert not mb.from_mujoco(xml).loads
 
 
+FLAGGED = """<mujoco><option><flag {}="disable" gravity="disable"/></option><worldbody><body>
+<joint name="j" {}/><inertial pos="0 0 0" mass="1" diaginertia="1 1 2"/></body></worldbody>
+<actuator><motor joint="j" ctrlrange="-1 1" ctrllimited="true"/></actuator></mujoco>"""
+
+
+@pytest.mark.parametrize(
+    ("flag", "expected"), [("clampctrl", 1.25), ("spring", 0.5), ("damper", 0.5)]
+)
+def test_flags(flag, expected):
+    """Controls may be meant beyond their limits; disabled springs are none where the file has none."""
+    damped = 'damping="0"' if flag == "damper" else 'stiffness="0"'
+    model = mujoco.MjModel.from_xml_string(FLAGGED.format(flag, damped))
+    data = mujoco.MjData(model)
+    data.ctrl[:] = 2.5
+    mujoco.mj_forward(model, data)
+    joints = mb.JointCoordinates(mb.from_mujoco(model, control=lambda t, args: args))
+    found = joints.terms.vf(0.0, joints.state(), jnp.array([2.5]))[1]
+    np.testing.assert_allclose(found, data.qacc, rtol=1e-12)
+    np.testing.assert_allclose(found, [expected], rtol=1e-12)
+    if flag != "clampctrl":
+        xml = FLAGGED.format(flag, damped.replace("0", "1"))
+        with pytest.raises(ValueError, match=f"disabled springs or dampers: flag {flag}"):
+            mb.from_mujoco(xml)
+
+
 def test_contacts_that_the_file_excludes():
     other = '<body name="other" pos="1 0 0"><freejoint/><geom size="0.1"/></body>'
     excluded = '<contact><exclude body1="other" body2="bob"/></contact>'

@@ -46,7 +46,8 @@ def _actuator(tree: Tree, control: Callable | None, i: int) -> list[AbstractForc
     affine = int(tree.mujoco.mjtBias.mjBIAS_AFFINE)
     bias = model.actuator_biasprm[i, :3] * (model.actuator_biastype[i] == affine)
     least, most = map(float, model.actuator_ctrlrange[i])
-    limits = (least, most) if model.actuator_ctrllimited[i] else (-np.inf, np.inf)
+    is_clamped = model.actuator_ctrllimited[i] and not disabled(tree.mujoco, model, "CLAMPCTRL")
+    limits = (least, most) if is_clamped else (-np.inf, np.inf)
     is_limited = bool(model.actuator_forcelimited[i])
     if len(joints) > 1 or is_limited:
         drive = _Drive(control, int(model.actuator_ctrladr[i]), gain, limits, float(bias[0]))

@@ -126,8 +126,11 @@ def _unsupported(mujoco: Any, model: Any) -> Iterator[tuple[str, str]]:
     yield from _contacts(mujoco, model)
     if model.opt.density != 0 or model.opt.viscosity != 0:
         yield "fluid", "density and viscosity of option"
-    for flag in ("SPRING", "DAMPER"):
-        if disabled(mujoco, model, flag):
+    for flag, of_joints, of_tendons in (
+        ("SPRING", model.jnt_stiffness, model.tendon_stiffness),
+        ("DAMPER", model.dof_damping, model.tendon_damping),
+    ):
+        if disabled(mujoco, model, flag) and (np.any(of_joints != 0) or np.any(of_tendons != 0)):
             yield "disabled springs or dampers", f"flag {flag.lower()}"
 
 
