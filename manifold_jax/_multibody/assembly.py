@@ -15,6 +15,7 @@ from .._mechanics import MechanicalSystem
 from .bodies import Bodies, Body, Pose
 from .checks import check_shape, floating, is_concrete
 from .couplings import Couplings, group_couplings
+from .energy import energy_of
 from .equations import DRIVEN
 from .force_groups import group_forces
 from .forces import AbstractForce
@@ -23,10 +24,10 @@ from .independent import find_independent, Independent
 from .joint_forces import find_joint_forces
 from .joint_groups import group_restraints, JointGroup, residuals
 from .joints import AbstractRestraint, Revolute
+from .known_coordinates import NONE_KNOWN
 from .loads import AbstractLoads
 from .picture import draw_outline, new_axes, outline_of, write_film
 from .reading import Energy, JointForce, Motion, over_times, Times
-from .rotations import rates_matrix, turn
 from .rotors import group_rotors, Rotors
 from .start import make_state
 from .system import check_for_poses, ConstantAssembly, system_of
@@ -106,8 +107,8 @@ class Assembly(eqx.Module):
         """Masses, constraints and forces as a [`MechanicalSystem`][], which has the `terms`, the
         manifold `constraint` and the `multipliers`.
 
-        **Raises** `ValueError` for [`RotorInertia`][], [`Coupling`][] and bodies without mass: use
-        [`JointCoordinates`][]."""
+        **Raises** `ValueError` for [`RotorInertia`][], [`Coupling`][], bodies without mass, and springs, servo motors and
+        stops of hinges that reach beyond half a turn: use [`JointCoordinates`][]."""
         check_for_poses(self)
         rows = None if self.independent is None else self.independent.rows
         return system_of(ConstantAssembly(self), self.redundant and rows is None, rows)
@@ -233,19 +234,9 @@ class Assembly(eqx.Module):
 
     @over_times
     def energy(self, y: tuple[Pose, Pose]) -> Energy:
-        """Return kinetic energy, and potential energy of weight and springs."""
-        q, v = y
-        bodies, frames = self.bodies, Frames.of(q, v)
-        moving = jnp.sum(bodies.mass[:, None] * v.position**2)
-        if bodies.planar:
-            turning = jnp.sum(bodies.inertia * v.orientation**2)
-        else:
-            spin = 2 * turn(rates_matrix(q.orientation), v.orientation)
-            turning = jnp.sum(spin * turn(bodies.inertia, spin))
-        of_rotors = sum((rotors.energy(frames) for rotors in self.rotors), jnp.zeros_like(moving))
-        weight = -jnp.sum(bodies.mass * (frames.origin[:-1] @ self.gravity))
-        stored = sum((loads.potential(frames) for loads in self.loads), weight)
-        return Energy((moving + turning) / 2 + of_rotors, stored)
+        """Return kinetic energy, and potential energy of weight and springs, whose angles are from `-pi` to `pi`:
+        beyond use that of [`JointCoordinates`][]."""
+        return energy_of(self, y, NONE_KNOWN)
 
     def draw(
         self,

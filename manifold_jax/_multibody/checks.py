@@ -1,5 +1,6 @@
 """Checks of the numbers, vectors and names that users give."""
 
+import abc
 from collections.abc import Sequence
 from typing import Any
 
@@ -12,6 +13,17 @@ from jaxtyping import Array
 
 from .._base.types import Args, RealScalarLike
 from .._base.user_functions import check_function
+
+
+class AbstractBounded(eqx.Module):
+    """A function `f(t, args)` whose values are known to lie within `bounds`."""
+
+    @property
+    @abc.abstractmethod
+    def bounds(self) -> tuple[float, float]: ...
+
+    @abc.abstractmethod
+    def __call__(self, t: RealScalarLike, args: Args) -> Any: ...
 
 
 class Values(eqx.Module):
@@ -38,8 +50,21 @@ class Values(eqx.Module):
         found = (value(t, args) if callable(value) else value for value in self.given)
         return stack(list(map(self._checked, found, self.names)))
 
+    @property
+    def bounds(self) -> np.ndarray:
+        """The least and the largest of each of several numbers, `(2, k)`; NaN where they are not known."""
+        return np.array([_bounds_of(value) for value in self.given]).T
+
     def _checked(self, value: Any, name: str) -> Array:
         return check_shape(f"{name}: `{self.word}`", value, self.shape)
+
+
+def _bounds_of(value: Any) -> tuple[float, float]:
+    if isinstance(value, AbstractBounded):
+        return value.bounds
+    if callable(value) or not is_concrete(value):
+        return np.nan, np.nan
+    return float(value), float(value)
 
 
 def floating(value: Any) -> Array:

@@ -10,6 +10,7 @@ from .._base.types import Args, FloatScalar, RealScalarLike
 from .bodies import Bodies
 from .checks import check_axis, check_shape, is_concrete, stack
 from .frames import Frames, in_space
+from .known_coordinates import KnownCoordinates
 from .loads import AbstractLoads, apply, State, Wrench
 from .rotations import dot, length_of, turn
 
@@ -20,7 +21,6 @@ _LARGEST = float(np.finfo(np.float32).max)  # limits beyond it are never reached
 class StopLaws(eqx.Module):
     """The laws of [`JointStop`][] in `k` joints."""
 
-    hinge: bool = eqx.field(static=True)
     lower: Float[Array, " k"]
     upper: Float[Array, " k"]
     stiffness: Float[Array, " k"]
@@ -37,12 +37,22 @@ class StopLaws(eqx.Module):
         below, above = self._depths(x)
         return jnp.sum(self.stiffness * (below**2 + above**2)) / 2
 
+    def nearest(self, x: Float[Array, " k"]) -> Float[Array, " k"]:
+        """Return angles that are known but for whole turns: those nearest to the middle of the stops."""
+        has_middle = (self.lower > -_LARGEST) & (self.upper < _LARGEST)
+        middle = jnp.where(has_middle, (self.lower + self.upper) / 2, 0)
+        return x - 2 * jnp.pi * jnp.round((x - middle) / (2 * jnp.pi))
+
+    @property
+    def reach_beyond_half_a_turn(self) -> np.ndarray:
+        if not (is_concrete(self.lower) and is_concrete(self.upper)):
+            return np.zeros(self.lower.shape, bool)
+        limits = np.stack([self.lower, self.upper])
+        number = np.sum(np.abs(limits) < _LARGEST, axis=0)
+        is_alone = (number == 1) & (np.abs(limits).min(axis=0) >= np.pi)
+        return is_alone | ((number == 2) & (limits[1] - limits[0] >= 2 * np.pi))
+
     def _depths(self, x: Float[Array, " k"]) -> tuple[Float[Array, " k"], Float[Array, " k"]]:
-        if self.hinge:
-            # Poses tell angles but for whole turns: those nearest to the middle are meant.
-            has_middle = (self.lower > -_LARGEST) & (self.upper < _LARGEST)
-            middle = jnp.where(has_middle, (self.lower + self.upper) / 2, 0)
-            x = x - 2 * jnp.pi * jnp.round((x - middle) / (2 * jnp.pi))
         return jax.nn.relu(self.lower - x), jax.nn.relu(x - self.upper)
 
 
@@ -60,6 +70,13 @@ class FrictionLaws(eqx.Module):
     def energy(self, x: Float[Array, " k"]) -> FloatScalar:
         return jnp.zeros((), x.dtype)
 
+    def nearest(self, x: Float[Array, " k"]) -> Float[Array, " k"]:
+        return x
+
+    @property
+    def reach_beyond_half_a_turn(self) -> np.ndarray:
+        return np.zeros(self.torque.shape, bool)
+
 
 class ContactLoads(AbstractLoads):
     """The forces of [`GroundContact`][] at `k` points, with a point and the unit normal of each plane."""
@@ -73,7 +90,9 @@ class ContactLoads(AbstractLoads):
     friction: Float[Array, " k"]
     slip: Float[Array, " k"]
 
-    def wrench(self, t: RealScalarLike, y: State, frames: Frames, args: Args) -> Wrench:
+    def wrench(
+        self, t: RealScalarLike, y: State, frames: Frames, known: KnownCoordinates, args: Args
+    ) -> Wrench:
         index = np.asarray(self.bodies)
         arm = turn(frames.rotation[index], self.points)
         place = frames.origin[index] + arm
@@ -86,7 +105,7 @@ class ContactLoads(AbstractLoads):
         force = push[:, None] * self.normal - braking[:, None] * along
         return apply(frames, index, place, force, jnp.zeros_like(force))
 
-    def potential(self, frames: Frames) -> FloatScalar:
+    def potential(self, frames: Frames, known: KnownCoordinates) -> FloatScalar:
         index = np.asarray(self.bodies)
         place = frames.origin[index] + turn(frames.rotation[index], self.points)
         return jnp.sum(self.stiffness * self._depth(place) ** 2) / 2
@@ -105,27 +124,16 @@ def _push(
     return stiffness * depth * jax.nn.relu(1 + dissipation * rate)
 
 
-def stop_laws(hinge: bool, stops: tuple, names: tuple[str, ...]) -> StopLaws:
+def stop_laws(stops: tuple, names: tuple[str, ...]) -> StopLaws:
     lower, upper = (_limits(word, stops, names) for word in ("lower", "upper"))
     if is_concrete(lower) and is_concrete(upper):
         for low, high, name in zip(np.asarray(lower), np.asarray(upper), names, strict=True):
-            _check_limits(hinge, float(low), float(high), name)
+            if not low < high:
+                raise ValueError(
+                    f"{name}: `lower` must be less than `upper`, got {low:.6g} and {high:.6g}."
+                )
     stiffness = _numbers("stiffness", stops, names, positive=True)
-    return StopLaws(hinge, lower, upper, stiffness, _numbers("dissipation", stops, names))
-
-
-def _check_limits(hinge: bool, lower: float, upper: float, name: str) -> None:
-    if not lower < upper:
-        raise ValueError(
-            f"{name}: `lower` must be less than `upper`, got {lower:.6g} and {upper:.6g}."
-        )
-    finite = [limit for limit in (lower, upper) if abs(limit) < _LARGEST]
-    is_beyond = len(finite) == 1 and abs(finite[0]) >= np.pi
-    if hinge and (is_beyond or (len(finite) == 2 and upper - lower >= 2 * np.pi)):
-        raise ValueError(
-            f"{name}: the stops of a hinge must be less than 2 pi apart, and a single one between -pi and pi, as poses of "
-            f"bodies do not tell whole turns; got {lower:.6g} and {upper:.6g}. Leave out stops that are not reached."
-        )
+    return StopLaws(lower, upper, stiffness, _numbers("dissipation", stops, names))
 
 
 def _limits(word: str, stops: tuple, names: tuple[str, ...]) -> Float[Array, " k"]:
@@ -139,7 +147,7 @@ def _limits(word: str, stops: tuple, names: tuple[str, ...]) -> Float[Array, " k
     return stack(found)
 
 
-def friction_laws(hinge: bool, frictions: tuple, names: tuple[str, ...]) -> FrictionLaws:
+def friction_laws(frictions: tuple, names: tuple[str, ...]) -> FrictionLaws:
     slip = _numbers("slip", frictions, names, positive=True)
     return FrictionLaws(_numbers("torque", frictions, names), slip)
 

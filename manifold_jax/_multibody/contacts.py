@@ -22,7 +22,8 @@ class JointStop(AbstractJointForce):
 
     - `joint`: as for [`JointSpring`][].
     - `lower`, `upper` (rad or m): where the stops are, counted from the drawing; `-jnp.inf` or `jnp.inf` for none.
-        Those of a hinge are less than `2 pi` apart, a single one is between `-pi` and `pi`: whole turns are not counted.
+        Poses do not tell whole turns: stops of a hinge that are `2 pi` apart or more, or a single one beyond `pi`, need
+        [`JointCoordinates`][], and otherwise angles are those nearest to the middle of the stops.
     - `stiffness` (N m/rad or N/m), positive.
     - `dissipation` (s/rad or s/m), not negative: a stop that is hit at the speed `v` gives back the fraction `e` of it,
         where `c v (1 + e) = log((1 + c v) / (1 - c v e))` with this `c`: about `1 - 2 c v / 3`.

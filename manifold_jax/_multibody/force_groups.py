@@ -95,8 +95,9 @@ def _loads(
     if joint is not None:
         laws = {contacts.JointStop: stop_laws, contacts.JointFriction: friction_laws}
         hinge = joint is joints.Revolute
-        own = laws.get(kind, _joint_laws)(hinge, things, names)
-        return JointLoads(hinge, attachment_of(found, names), own)
+        own = laws.get(kind, _joint_laws)(things, names)
+        of_joints = tuple(thing.joint for thing in things)
+        return JointLoads(hinge, of_joints, attachment_of(found, names), own)
     if kind is forces.AbstractLineForce:
         return LineLoads(attach(bodies, things, names), _laws(things, names, "length"))
     if kind is forces.RotationalDamper:
@@ -106,7 +107,7 @@ def _loads(
     return _on_bodies(kind is forces.Torque, bodies, things, names)
 
 
-def _joint_laws(hinge: bool, things: tuple, names: tuple[str, ...]) -> SpringLaws:
+def _joint_laws(things: tuple, names: tuple[str, ...]) -> SpringLaws:
     return _laws(things, names, "rest")
 
 

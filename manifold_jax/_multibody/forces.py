@@ -108,10 +108,13 @@ class JointSpring(AbstractJointForce):
 
     **Arguments:**
 
-    - `joint`: the name of a [`Revolute`][] or [`Prismatic`][]. Its coordinate `x`, an angle from
-        `-pi` to `pi` or a distance, is that of the second body relative to the first, about or along
-        its axis (in the plane counter-clockwise), and zero in the drawing.
-    - `stiffness` (N m/rad or N/m), `rest` (rad or m), `damping` (N m s/rad or N s/m).
+    - `joint`: the name of a [`Revolute`][] or [`Prismatic`][]. Its coordinate `x`, an angle or a distance, is that
+        of the second body relative to the first, about or along its axis (in the plane counter-clockwise), and zero in
+        the drawing. Angles among the [`JointCoordinates`][] continue beyond `pi`. Those of hinges that close loops, and
+        all where the assembly itself is solved, are from `-pi` to `pi`, as poses do not tell whole turns: the torque
+        of a spring then jumps at half a turn.
+    - `stiffness` (N m/rad or N/m), `rest` (rad or m), `damping` (N m s/rad or N s/m). With a `rest` beyond half a turn
+        the assembly must be solved in [`JointCoordinates`][].
     """
 
     stiffness: Any = 0.0
@@ -186,7 +189,9 @@ class Tendon(AbstractForce):
         F = value - stiffness (l - rest) - damping l',   within `limits`.
 
     With one joint it is a servo motor of limited torque: `Tendon(("elbow",), (1.0,), lambda t, args: 50 * args,
-    stiffness=50.0, damping=2.0, limits=(-10.0, 10.0))` turns the elbow to the angle `args`.
+    stiffness=50.0, damping=2.0, limits=(-10.0, 10.0))` turns the elbow to the angle `args`. To angles beyond `pi` it does
+    so in [`JointCoordinates`][] alone: poses do not tell whole turns, and it would turn for ever. Such targets are
+    refused there where they are known, as numbers are, but not functions.
 
     **Arguments:**
 

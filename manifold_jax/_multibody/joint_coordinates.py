@@ -14,7 +14,11 @@ from .._mechanics import MechanicalConstraint, MechanicalSystem
 from .assembly import Assembly
 from .bodies import Pose
 from .checks import is_concrete
+from .contact_loads import StopLaws
+from .energy import energy_of
 from .frames import Frames
+from .loads import JointLoads
+from .reading import Energy
 from .rotors import names_of
 from .spanning_tree import find_spanning_tree, SpanningTree
 from .start import CLOSED
@@ -40,7 +44,8 @@ class JointCoordinates(eqx.Module):
     joints = mb.JointCoordinates(robot)
     hook = mj.Projected(dfx.Dopri8(), joints.constraint)
     sol = mj.diffeqsolve(joints.terms, hook, 0.0, 1.0, 0.01, joints.state(), ...)
-    robot.gaps(joints.poses(sol.ys)[0])  # also motion, point, energy, draw, animate
+    robot.gaps(joints.poses(sol.ys)[0])  # also motion, point, draw, animate
+    joints.energy(sol.ys)
     ```
 
     `q` has far fewer numbers than the poses of all bodies, and the joints of the tree hold by construction: a robot
@@ -65,7 +70,8 @@ class JointCoordinates(eqx.Module):
         [`equilibrium`][manifold_jax.equilibrium] and [`rattle`][manifold_jax.rattle].
 
     The tree is the one with the fewest coordinates among those with all joints that have [`RotorInertia`][] or
-    [`Coupling`][].
+    [`Coupling`][], and all hinges with springs, servo motors or stops beyond half a turn. Angles of its hinges continue
+    beyond `pi`.
 
     **Raises** `ValueError` where such joints form a closed loop, and for bodies without mass that
     move no others, or that joints can move while nothing with mass moves.
@@ -87,13 +93,15 @@ class JointCoordinates(eqx.Module):
             )
         self.assembly = assembly
         coupled = assembly.couplings.joints + assembly.couplings.others
-        needed = tuple(dict.fromkeys(names_of(assembly.rotors) + coupled))
+        turning = (name for loads in assembly.loads for name in loads.joints_with_whole_turns)
+        needed = tuple(dict.fromkeys((*names_of(assembly.rotors), *coupled, *turning)))
         self.tree = find_spanning_tree(assembly.joints, len(assembly.names), needed)
         if not set(needed) <= set(self.names):
             left = [name for name in needed if name not in self.names]
             raise ValueError(
-                f"`assembly`: joints with `RotorInertia` or `Coupling` form a closed loop, with {left[:12]}. One joint of "
-                "every loop must have neither: leave one out, or add the inertia of a rotor to that of a body."
+                f"`assembly`: joints with `RotorInertia` or `Coupling`, and hinges with springs, servo motors or stops beyond half "
+                f"a turn, form a closed loop, with {left[:12]}. One joint of every loop must have neither: leave one out, or add "
+                "the inertia of a rotor to that of a body."
             )
         coordinates = self._motion.coordinates
         check_masses(assembly, self.tree, coordinates)
@@ -125,12 +133,13 @@ class JointCoordinates(eqx.Module):
 
     def state(self, y: tuple[Pose, Pose] | None = None) -> State:
         """Return the state `(q, v)` of a state of the assembly, by default `assembly.state()`, the drawing at
-        rest. Angles are from `-pi` to `pi`.
+        rest. Poses do not tell whole turns: angles are from `-pi` to `pi`, those of a hinge with stops as near as
+        possible to the middle of these. Add multiples of `2 pi` to others.
 
         **Raises** `ValueError` if the state does not satisfy the joints of the tree.
         """
         y = self.assembly.state() if y is None else y
-        found = _coordinates_of(self._motion, y)
+        found = _between_stops(self._motion, _stops_of_hinges(self.assembly), y)
         if all(map(is_concrete, jtu.tree_leaves((self.assembly, y)))):
             self._check(found, y)
         return found
@@ -140,6 +149,13 @@ class JointCoordinates(eqx.Module):
         if y[0].ndim > 1:
             return jax.vmap(self.poses)(y)
         return poses_of(self._motion, *y)
+
+    def energy(self, y: State) -> Energy:
+        """Return kinetic energy, and potential energy of weight and springs, whose angles continue beyond `pi`. `y` may
+        have leading axes, such as `sol.ys`."""
+        if y[0].ndim > 1:
+            return jax.vmap(self.energy)(y)
+        return energy_of(self.assembly, self.poses(y), self._motion.coordinates.known(y[0]))
 
     @property
     def _motion(self) -> TreeMotion:
@@ -179,7 +195,26 @@ class JointCoordinates(eqx.Module):
         return find_independent_loops(self.assembly, self._motion, q)
 
 
+def _stops_of_hinges(assembly: Assembly) -> tuple[JointLoads, ...]:
+    in_hinges = (loads for loads in assembly.loads if isinstance(loads, JointLoads) and loads.hinge)
+    return tuple(loads for loads in in_hinges if isinstance(loads.laws, StopLaws))
+
+
 # One program each, not one for each operation.
+@eqx.filter_jit
+def _between_stops(
+    motion: TreeMotion, stops: tuple[JointLoads, ...], y: tuple[Pose, Pose]
+) -> State:
+    """Return coordinates and rates, with those whole turns of hinges that are nearest to their stops."""
+    q, v = coordinates_of(motion, y)
+    for loads in stops:
+        known = motion.coordinates.known(q)
+        places, numbers = known.find(loads.joints)
+        x = known.instead_of(jnp.zeros_like(loads.laws.lower), loads.joints)
+        q = q.at[numbers].set(loads.laws.nearest(x)[places])
+    return q, v
+
+
 _coordinates_of = eqx.filter_jit(coordinates_of)
 _poses = eqx.filter_jit(poses_of)
 _frames = eqx.filter_jit(Frames.of)

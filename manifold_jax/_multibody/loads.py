@@ -1,6 +1,7 @@
 """Loads: the effects of forces on the bodies, all of one kind in one array computation."""
 
 import abc
+import itertools
 from collections.abc import Callable
 from typing import Any
 
@@ -10,10 +11,11 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._base.types import Args, FloatScalar, RealScalarLike
-from .attachment import Attachment
+from .attachment import Attachment, Sides
 from .bodies import Pose
-from .checks import floating, Values
+from .checks import floating, is_concrete, Values
 from .frames import Frames, in_space, Vectors
+from .known_coordinates import HALF_TURN, KnownCoordinates
 from .rotations import dot, length_of, turn
 
 
@@ -25,13 +27,20 @@ class AbstractLoads(eqx.Module):
     """All forces of one kind."""
 
     @abc.abstractmethod
-    def wrench(self, t: RealScalarLike, y: State, frames: Frames, args: Args) -> Wrench:
+    def wrench(
+        self, t: RealScalarLike, y: State, frames: Frames, known: KnownCoordinates, args: Args
+    ) -> Wrench:
         """Return forces and torques on the bodies and, last, the ground, in the state `y` with these
-        `frames`."""
+        `frames`, where some coordinates of joints are `known`."""
 
     @abc.abstractmethod
-    def potential(self, frames: Frames) -> FloatScalar:
+    def potential(self, frames: Frames, known: KnownCoordinates) -> FloatScalar:
         """Return the energy stored in springs."""
+
+    @property
+    def joints_with_whole_turns(self) -> tuple[str, ...]:
+        """The hinges whose angles must be known beyond half a turn."""
+        return ()
 
 
 class SpringLaws(eqx.Module):
@@ -54,6 +63,16 @@ class SpringLaws(eqx.Module):
     def energy(self, x: Float[Array, " k"]) -> FloatScalar:
         return jnp.sum(self.stiffness * (x - self.rest) ** 2) / 2
 
+    def nearest(self, x: Float[Array, " k"]) -> Float[Array, " k"]:
+        return x
+
+    @property
+    def reach_beyond_half_a_turn(self) -> np.ndarray:
+        if not (is_concrete(self.rest) and is_concrete(self.stiffness)):
+            return np.zeros(self.rest.shape, bool)
+        is_far = np.abs(np.asarray(self.rest)) > HALF_TURN
+        return is_far & (np.asarray(self.stiffness) != 0)
+
 
 class LineLoads(AbstractLoads):
     """Loads along lines between two points, against their distance: springs, dampers, cylinders."""
@@ -61,7 +80,9 @@ class LineLoads(AbstractLoads):
     attachment: Attachment
     laws: SpringLaws
 
-    def wrench(self, t: RealScalarLike, y: State, frames: Frames, args: Args) -> Wrench:
+    def wrench(
+        self, t: RealScalarLike, y: State, frames: Frames, known: KnownCoordinates, args: Args
+    ) -> Wrench:
         sides = self.attachment.sides(frames)
         velocities = self.attachment.velocities(frames, sides)
         pull = self._pull(t, sides.gap, velocities, args)
@@ -85,31 +106,45 @@ class LineLoads(AbstractLoads):
         undefined = jnp.where(jump == 0, 0, jnp.nan).astype(gap.dtype)
         return jnp.where(apart[:, None], along, smooth + undefined[:, None])
 
-    def potential(self, frames: Frames) -> FloatScalar:
+    def potential(self, frames: Frames, known: KnownCoordinates) -> FloatScalar:
         return self.laws.energy(length_of(self.attachment.sides(frames).gap))
 
 
 class JointLoads(AbstractLoads):
-    """Loads in hinges, or in sliders."""
+    """Loads in hinges, or in sliders, with the names `joints`."""
 
     hinge: bool = eqx.field(static=True)
+    joints: tuple[str, ...] = eqx.field(static=True)
     attachment: Attachment
     laws: Any  # `SpringLaws`, or others with the same methods
 
-    def wrench(self, t: RealScalarLike, y: State, frames: Frames, args: Args) -> Wrench:
+    def wrench(
+        self, t: RealScalarLike, y: State, frames: Frames, known: KnownCoordinates, args: Args
+    ) -> Wrench:
         sides = self.attachment.sides(frames)
         axis = sides.frame_first[:, :, 2]
         first, second = self.attachment.index
         rate = self.attachment.rates(frames, sides, self.hinge)
-        push = -self.laws.force(sides.coordinate(self.hinge), rate, t, args)[:, None] * axis
+        x = self._coordinates(sides, known)
+        push = -self.laws.force(x, rate, t, args)[:, None] * axis
         none = jnp.zeros_like(axis)
         force, torque = (none, push) if self.hinge else (push, none)
         # both at the second point: a slider's force and its opposite lie on one line
         on_second = apply(frames, second, sides.second, force, torque)
         return add(on_second, apply(frames, first, sides.second, -force, -torque))
 
-    def potential(self, frames: Frames) -> FloatScalar:
-        return self.laws.energy(self.attachment.sides(frames).coordinate(self.hinge))
+    def potential(self, frames: Frames, known: KnownCoordinates) -> FloatScalar:
+        return self.laws.energy(self._coordinates(self.attachment.sides(frames), known))
+
+    def _coordinates(self, sides: Sides, known: KnownCoordinates) -> Float[Array, " k"]:
+        read = sides.coordinate(self.hinge)
+        return known.instead_of(self.laws.nearest(read) if self.hinge else read, self.joints)
+
+    @property
+    def joints_with_whole_turns(self) -> tuple[str, ...]:
+        if not self.hinge:
+            return ()
+        return tuple(itertools.compress(self.joints, self.laws.reach_beyond_half_a_turn))
 
 
 class BodyLoads(AbstractLoads):
@@ -120,7 +155,9 @@ class BodyLoads(AbstractLoads):
     points: Float[Array, "k 3"]
     values: Values
 
-    def wrench(self, t: RealScalarLike, y: State, frames: Frames, args: Args) -> Wrench:
+    def wrench(
+        self, t: RealScalarLike, y: State, frames: Frames, known: KnownCoordinates, args: Args
+    ) -> Wrench:
         index, value = np.asarray(self.bodies), self.values.at(t, args)
         if value.ndim == 1:  # about the normal of the plane
             value = jnp.pad(value[:, None], ((0, 0), (2, 0)))
@@ -130,7 +167,7 @@ class BodyLoads(AbstractLoads):
         arm = turn(frames.rotation[index], self.points)
         return apply(frames, index, frames.origin[index] + arm, value, none)
 
-    def potential(self, frames: Frames) -> FloatScalar:
+    def potential(self, frames: Frames, known: KnownCoordinates) -> FloatScalar:
         return jnp.zeros((), frames.origin.dtype)
 
 
@@ -141,7 +178,9 @@ class ControlledLoads(AbstractLoads):
     attachment: Attachment
     law: Callable
 
-    def wrench(self, t: RealScalarLike, y: State, frames: Frames, args: Args) -> Wrench:
+    def wrench(
+        self, t: RealScalarLike, y: State, frames: Frames, known: KnownCoordinates, args: Args
+    ) -> Wrench:
         values = floating(self.law(t, y, args))
         if values.shape != (len(self.hinges),):
             raise ValueError(
@@ -150,7 +189,7 @@ class ControlledLoads(AbstractLoads):
             )
         return apply_in_joints(frames, self.attachment, self.hinges, values)
 
-    def potential(self, frames: Frames) -> FloatScalar:
+    def potential(self, frames: Frames, known: KnownCoordinates) -> FloatScalar:
         return jnp.zeros((), frames.origin.dtype)
 
 
@@ -160,14 +199,16 @@ class RotationalLoads(AbstractLoads):
     bodies: tuple[tuple[int, ...], tuple[int, ...]] = eqx.field(static=True)
     damping: Float[Array, " k"]
 
-    def wrench(self, t: RealScalarLike, y: State, frames: Frames, args: Args) -> Wrench:
+    def wrench(
+        self, t: RealScalarLike, y: State, frames: Frames, known: KnownCoordinates, args: Args
+    ) -> Wrench:
         first, second = np.asarray(self.bodies)
         torque = self.damping[:, None] * (frames.spin[first] - frames.spin[second])
         none = jnp.zeros_like(torque)
         on_second = apply(frames, second, frames.origin[second], none, torque)
         return add(on_second, apply(frames, first, frames.origin[first], none, -torque))
 
-    def potential(self, frames: Frames) -> FloatScalar:
+    def potential(self, frames: Frames, known: KnownCoordinates) -> FloatScalar:
         return jnp.zeros((), frames.origin.dtype)
 
 

@@ -40,8 +40,8 @@ def from_mujoco(
         MuJoCo.
     - `joints`, `forces`: further ones for the [`Assembly`][], such as [`GroundContact`][].
     - `stops`: `f(joint, lower, upper)` returns the force at the limits (rad or m, counted from the drawing: its `range`
-        less `qpos0`) of a limited hinge or slide, or `None` for no stop, as where the limits of a hinge are more than
-        a turn apart; such as `functools.partial(mb.JointStop, stiffness=1e3)`.
+        less `qpos0`) of a limited hinge or slide, or `None` for no stop; such as
+        `functools.partial(mb.JointStop, stiffness=1e3)`.
     - `ignore`: what to leave out instead of refusing it, by the words of the error message, such as
         `("contact", "joint limit")`.
     - `redundant`: as for [`Assembly`][].
@@ -50,7 +50,10 @@ def from_mujoco(
     stiffness, damping and armature of hinges and slides, damping of ball joints; `equality` of the types connect,
     weld and joint; gravity; fixed tendons; actuators of hinges, slides and fixed tendons with constant gain and affine
     bias (motor, position, velocity, damper). The drawing is the pose `qpos0`, with coupled joints where their couplings have them.
-    Stiffness of hinges counts angles from `-pi` to `pi`.
+
+    Angles of hinges that springs, servo motors (position actuators) and tendons turn beyond `pi` are those of MuJoCo in
+    [`JointCoordinates`][] alone. Where `ctrlrange`, `range` or `springref` reach there, the poses of bodies are refused as
+    coordinates; without a `ctrlrange` a servo motor that is told to turn there turns for ever in them.
 
     A body with several joints hangs on links without mass, `"torso (rootx)"` is the one of the body torso that its
     joint rootx moves. These, armature and couplings of joints need the coordinates of joints: solve

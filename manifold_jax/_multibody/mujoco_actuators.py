@@ -9,20 +9,20 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._base.types import Args, RealScalarLike
-from .checks import floating
-from .forces import AbstractForce, JointSpring, Motor, Tendon
+from .checks import AbstractBounded, floating
+from .forces import AbstractForce, Motor, Tendon
 from .mujoco_checks import actuator_fault, disabled, is_of_tendon, tendon_fault
 from .mujoco_tree import Tree
 
 
 # Type checkers do not know the arguments of dataclasses whose fields are `Any` in abstract bases.
 _MOTOR: Any = Motor
-_SPRING: Any = JointSpring
 _TENDON: Any = Tendon
 
 
 def actuators(tree: Tree, control: Callable | None) -> list[AbstractForce]:
-    """Return the motors of actuators: the torque is `gear (gain ctrl + b0 + b1 gear x + b2 gear x')`."""
+    """Return motors for actuators, and tendons where these go through several joints, have limits or are servo
+    motors: the torque is `gear (gain ctrl + b0 + b1 gear x + b2 gear x')`."""
     mujoco, model, found = tree.mujoco, tree.model, []
     if disabled(mujoco, model, "ACTUATION"):
         return found
@@ -49,21 +49,17 @@ def _actuator(tree: Tree, control: Callable | None, i: int) -> list[AbstractForc
     is_clamped = model.actuator_ctrllimited[i] and not disabled(tree.mujoco, model, "CLAMPCTRL")
     limits = (least, most) if is_clamped else (-np.inf, np.inf)
     is_limited = bool(model.actuator_forcelimited[i])
-    if len(joints) > 1 or is_limited:
+    is_servo = bias[1] != 0 or bias[2] != 0
+    if len(joints) > 1 or is_limited or is_servo:
         drive = _Drive(control, int(model.actuator_ctrladr[i]), gain, limits, float(bias[0]))
         spring = dict(stiffness=-bias[1], rest=-gear * zero, damping=-bias[2])
         bounds = tuple(map(float, model.actuator_forcerange[i])) if is_limited else None
         return [_TENDON(joints, gear * coefficients, drive, **spring, limits=bounds, name=name)]
     joint = next(iter(joints))
     gear *= float(coefficients[0])
-    zero /= float(coefficients[0])
     constant = gear * float(bias[0])
     drive = _Drive(control, int(model.actuator_ctrladr[i]), gear * gain, limits, constant)
-    found: list[AbstractForce] = [_MOTOR(joint, drive, name=name)]
-    if bias[1] != 0 or bias[2] != 0:
-        stiffness, damping = -(gear**2) * bias[1], -(gear**2) * bias[2]
-        found.append(_SPRING(joint, stiffness, -zero, damping, name=f"{name} bias"))
-    return found
+    return [_MOTOR(joint, drive, name=name)]
 
 
 def _transmission(tree: Tree, i: int) -> tuple[tuple[str, ...], np.ndarray, float]:
@@ -99,7 +95,7 @@ def tendon_springs(tree: Tree) -> list[AbstractForce]:
     return found
 
 
-class _Drive(eqx.Module):
+class _Drive(AbstractBounded):
     """One control, within its limits, times a factor, plus a constant."""
 
     control: Callable | None
@@ -107,6 +103,12 @@ class _Drive(eqx.Module):
     factor: float = eqx.field(static=True)
     limits: tuple[float, float] = eqx.field(static=True)
     constant: float = eqx.field(static=True)
+
+    @property
+    def bounds(self) -> tuple[float, float]:
+        given = np.zeros(2) if self.control is None else np.array([-np.inf, np.inf])
+        values = self.factor * np.clip(given, *self.limits) + self.constant
+        return float(values.min()), float(values.max())
 
     def __call__(self, t: RealScalarLike, args: Args) -> Float[Array, ""]:
         if self.control is None:

@@ -65,7 +65,8 @@ def link_names(mujoco: Any, model: Any, i: Index) -> list[str]:
 
 def state_of_mujoco(assembly: Assembly, model: Any, data: Any) -> tuple[Pose, Pose]:
     """Return the state `(q, v)` of an assembly of [`from_mujoco`][] for `qpos` and `qvel` in MuJoCo's
-    `data`. Calls `mj_forward` on it."""
+    `data`. Calls `mj_forward` on it. Poses do not tell whole turns: where `qpos` of a hinge is beyond `pi`, add multiples
+    of `2 pi` to its number in [`JointCoordinates`][]."""
     mujoco = import_mujoco()
     mujoco.mj_forward(model, data)
     chains = [link_names(mujoco, model, i) for i in range(model.nbody)]

@@ -15,6 +15,7 @@ from .bodies import Pose
 from .checks import is_concrete
 from .frames import Frames
 from .joint_groups import jacobian, residuals
+from .known_coordinates import NONE_KNOWN
 from .loads import add
 from .rotations import rates_matrix, turn_back
 from .rotors import names_of
@@ -29,12 +30,17 @@ class ConstantAssembly(eqx.Module):
 
 def check_for_poses(assembly: Any) -> None:
     """Raise for what is no part of a system in the poses of bodies: its mass matrix has a nonsingular block for
-    each, and their angles end at `pi`."""
+    each, and angles that are read from them end at `pi`."""
     mass = assembly.bodies.mass
     massless = np.flatnonzero(np.asarray(mass) == 0) if is_concrete(mass) else ()
     found = {
         "`RotorInertia` of the joints": names_of(assembly.rotors),
         "`Coupling`": assembly.couplings.names,
+        "springs, servo motors or stops beyond half a turn of the hinges": tuple(
+            dict.fromkeys(
+                name for loads in assembly.loads for name in loads.joints_with_whole_turns
+            )
+        ),
         "bodies without mass,": tuple(assembly.bodies.names[i] for i in massless),
     }
     if listed := "; ".join(f"{what} {list(own)[:12]}" for what, own in found.items() if own):
@@ -97,7 +103,7 @@ class _Forces(eqx.Module):
         weight = assembly.bodies.mass[:, None] * assembly.gravity[None, :]
         total = jnp.pad(weight, ((0, 1), (0, 0))), jnp.zeros_like(frames.origin)
         for loads in assembly.loads:
-            total = add(total, loads.wrench(t, (q, v), frames, args))
+            total = add(total, loads.wrench(t, (q, v), frames, NONE_KNOWN, args))
         force, torque = total[0][:-1], total[1][:-1]
         if q.planar:
             return Pose(force[:, :2], torque[:, 2])

@@ -1,5 +1,7 @@
 """Loads of tendons through several joints, all together."""
 
+import itertools
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -11,6 +13,7 @@ from .attachment import Attachment
 from .checks import as_pair, check_shape, is_concrete, on_host, stack
 from .frames import Frames
 from .joint_groups import attachment_of, find_joint, JointGroup
+from .known_coordinates import HALF_TURN, KnownCoordinates
 from .loads import AbstractLoads, apply_in_joints, SpringLaws, State, Wrench
 
 
@@ -27,24 +30,45 @@ class TendonLoads(AbstractLoads):
     lower: Float[Array, " m"]
     upper: Float[Array, " m"]
 
-    def wrench(self, t: RealScalarLike, y: State, frames: Frames, args: Args) -> Wrench:
+    def wrench(
+        self, t: RealScalarLike, y: State, frames: Frames, known: KnownCoordinates, args: Args
+    ) -> Wrench:
         sides = self.attachment.sides(frames)
         turning, sliding = (self.attachment.rates(frames, sides, hinge) for hinge in (True, False))
         rate = self._sums(jnp.where(np.array(self.hinges), turning, sliding))
-        pull = -self.laws.force(self._lengths(frames), rate, t, args)
+        pull = -self.laws.force(self._lengths(frames, known), rate, t, args)
         bounded = jnp.clip(pull, self.lower, self.upper)
         pull = jnp.where(np.array(self.limited), bounded, pull)
         values = self.coefficients * pull[np.array(self.tendons)]
         return apply_in_joints(frames, self.attachment, self.hinges, values)
 
-    def potential(self, frames: Frames) -> FloatScalar:
-        stretch = jnp.where(np.array(self.limited), 0, self._lengths(frames) - self.laws.rest)
+    def potential(self, frames: Frames, known: KnownCoordinates) -> FloatScalar:
+        stretch = jnp.where(
+            np.array(self.limited), 0, self._lengths(frames, known) - self.laws.rest
+        )
         return jnp.sum(self.laws.stiffness * stretch**2) / 2
 
-    def _lengths(self, frames: Frames) -> Float[Array, " m"]:
+    @property
+    def joints_with_whole_turns(self) -> tuple[str, ...]:
+        """The hinges of servo motors, which are tendons of one hinge, that turn to beyond half a turn."""
+        numbers = self.laws.stiffness, self.laws.rest, self.coefficients
+        if not all(map(is_concrete, numbers)):
+            return ()
+        (stiffness, rest, radii), tendons = map(np.asarray, numbers), np.array(self.tendons)
+        values = np.zeros((2, 1)) if self.laws.values is None else self.laws.values.bounds
+        with np.errstate(divide="ignore", invalid="ignore"):  # without springs, and unknown ones
+            lengths = rest + values / stiffness
+            angles = np.abs(lengths[:, tendons] / radii)
+        is_far = np.any(np.isfinite(angles) & (angles > HALF_TURN), axis=0)
+        is_alone = np.bincount(tendons)[tendons] == 1
+        found = is_far & is_alone & np.array(self.hinges)
+        return tuple(itertools.compress(self.attachment.names, found))
+
+    def _lengths(self, frames: Frames, known: KnownCoordinates) -> Float[Array, " m"]:
         sides = self.attachment.sides(frames)
         turned, shifted = (sides.coordinate(hinge) for hinge in (True, False))
-        return self._sums(jnp.where(np.array(self.hinges), turned, shifted))
+        read = jnp.where(np.array(self.hinges), turned, shifted)
+        return self._sums(known.instead_of(read, self.attachment.names))
 
     def _sums(self, x: Float[Array, " k"]) -> Float[Array, " m"]:
         """Return the sums over the joints of each tendon, times the coefficients."""

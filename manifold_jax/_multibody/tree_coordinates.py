@@ -3,8 +3,10 @@
 from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Array, Float
 
 from . import joints
+from .known_coordinates import KnownCoordinates
 from .spanning_tree import FREE, SpanningTree
 
 
@@ -62,6 +64,10 @@ class TreeCoordinates(NamedTuple):
         """Return the numbers of joints with one coordinate, by name."""
         known = {column.name: c for c, column in enumerate(self.columns)}
         return np.array([known[name] for name in names], int)
+
+    def known(self, q: Float[Array, " n"]) -> KnownCoordinates:
+        """Return the coordinates of the joints with one, by name."""
+        return KnownCoordinates(tuple(column.name for column in self.columns), q)
 
     def has(self, kind: str) -> bool:
         """Return whether any joint has coordinates of a kind."""

@@ -67,9 +67,9 @@ class TreeForces(eqx.Module):
             jnp.pad(mass * assembly.gravity[None], ((0, 1), (0, 0))),
             jnp.zeros_like(frames.origin),
         )
-        poses = poses_of(motion, q, v)
+        poses, known = poses_of(motion, q, v), motion.coordinates.known(q)
         for loads in assembly.loads:
-            total = add(total, loads.wrench(t, poses, frames, args))
+            total = add(total, loads.wrench(t, poses, frames, known, args))
         inertia, (acceleration, turning) = motion.inertia(at), motion.bias(at, frames, v)
         force = total[0][:-1] - mass * acceleration
         torque = total[1][:-1] - turn(inertia, turning) - jnp.cross(spin, turn(inertia, spin))

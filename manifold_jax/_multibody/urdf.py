@@ -113,8 +113,8 @@ def read_urdf(
         for none.
     - `joints`, `forces`: further ones for the [`Assembly`][], such as [`Drive`][] and [`Motor`][].
     - `stops`: `f(joint, lower, upper)` returns the force at the limits (rad or m, counted from the drawing) of a hinge
-        or slider in the file, or `None` for no stop, as where the limits of a hinge are more than a turn apart; such
-        as `functools.partial(mb.JointStop, stiffness=1e3)`. Hinges with limits are then not joined to universal
+        or slider in the file, or `None` for no stop; such as `functools.partial(mb.JointStop, stiffness=1e3)`. Limits
+        of a hinge that are a turn apart or more need [`JointCoordinates`][]. Hinges with limits are then not joined to universal
         joints: links without mass between them need [`JointCoordinates`][]. Without `stops` limits are not enforced.
     - `gravity` (m/s^2).
     - `ignore`: what to leave out, some of `("friction", "mimic")`: Coulomb friction is not supported; joints
