@@ -100,7 +100,7 @@ class JointCoordinates(eqx.Module):
             left = [name for name in needed if name not in self.names]
             raise ValueError(
                 f"`assembly`: joints with `RotorInertia` or `Coupling`, and hinges with springs, servo motors or stops beyond half "
-                f"a turn, form a closed loop, with {left[:12]}. One joint of every loop must have neither: leave one out, or add "
+                f"a turn, form a closed loop, with {left[:12]}. One joint of every loop must have none of these: leave one out, or add "
                 "the inertia of a rotor to that of a body."
             )
         coordinates = self._motion.coordinates
