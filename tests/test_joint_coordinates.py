@@ -346,7 +346,9 @@ def test_messages_of_rotors(as_a_user_meets_it):
         system.terms.vf(0.0, chain().state(assemble=True), None)
     everywhere = [*ROTORS, "Revolute crank-rod"]
     assembly = in_the_plane(rotors=[mb.RotorInertia(joint, 1.0) for joint in everywhere])
-    with pytest.raises(ValueError, match="joints with `RotorInertia` or `Coupling` form a closed"):
+    with pytest.raises(
+        ValueError, match="joints with `RotorInertia` or `Coupling`, .* form a closed"
+    ):
         mb.JointCoordinates(assembly)
     with pytest.raises(ValueError, match="`inertia` must not be negative, got -1"):
         chain(rotors=[mb.RotorInertia("Prismatic upper-lower", -1.0)])
