@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.integrate
 
 import manifold_jax as mj
 
@@ -124,6 +125,37 @@ def test_lanes_are_one_by_one():
     each = [jax.jit(jax.value_and_grad(alone))(ARGS["stiffness"], i) for i in range(2)]
     np.testing.assert_allclose(value, sum(x for x, _ in each), rtol=1e-13)
     np.testing.assert_allclose(slope, sum(x for _, x in each), rtol=1e-11)
+
+
+def test_an_invariant_with_its_sign_changed():
+    """The steps are the same, with the linear invariant beside it, and so are derivatives in both modes."""
+    minus = lambda t, y, args: -energy(t, y, args)
+
+    def ends(args, invariant):
+        hook = mj.Relaxation(dfx.Tsit5(), mj.Invariants(invariant, y0=START, args=args))
+        parts = dfx.ODETerm(field), hook, 0.0, 1.0, 0.1, START, args
+        return jnp.concatenate([y[-1] for y in mj.diffeqsolve(*parts, max_steps=16).ys])
+
+    value, slopes = ends(ARGS, energy), jax.jacfwd(ends)(ARGS, energy)
+    np.testing.assert_allclose(ends(ARGS, minus), value, rtol=1e-13)
+    np.testing.assert_allclose(value[2] + value[3], -0.5, rtol=1e-14)
+    for derivative in (jax.jacfwd, jax.jacrev):
+        flipped = jax.jit(lambda args, of=derivative: of(ends)(args, minus))(ARGS)
+        jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-11), flipped, slopes)
+
+
+def test_an_invariant_neither_convex_nor_concave():
+    """A pendulum goes over the top, where the energy falls along the line of the first step."""
+    swing = lambda t, y, args: jnp.stack([y[1], -jnp.sin(y[0])])
+    level = mj.Invariants(
+        lambda t, y, args: y[1] ** 2 / 2 - jnp.cos(y[0]), y0=jnp.array([3.0, 0.5])
+    )
+    hook, y0 = mj.Relaxation(dfx.Tsit5(), level), np.array([3.0, 0.5])
+    sol = mj.diffeqsolve(dfx.ODETerm(swing), hook, 0.0, 5.0, 0.05, y0)
+    own = lambda t, y: [y[1], -np.sin(y[0])]
+    end = scipy.integrate.solve_ivp(own, (0, 5), y0, "DOP853", rtol=1e-12, atol=1e-12).y[:, -1]
+    np.testing.assert_allclose(sol.ys[-1], end, rtol=0, atol=1e-7)
+    assert abs(level(0.0, sol.ys[-1])) < 1e-14
 
 
 def test_bad_input():

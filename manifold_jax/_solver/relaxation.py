@@ -16,6 +16,7 @@ from .._constraint.constraint import AbstractConstraint
 from .._constraint.correction import equations_of, solve_correction
 from .._constraint.projection_info import ProjectionInfo
 from .._constraint.settings import NewtonProjection
+from .._linalg.rows import multiply
 from .base import check_hook_arguments, check_one_equation
 from .interpolation import CorrectedInterpolation
 from .on_manifold import AbstractStepsOnManifold
@@ -78,14 +79,17 @@ class RelaxedSteps(dfx.AbstractSolver):
         """Return the root on the line through `y1` in this direction."""
         line, safe = (jfu.ravel_pytree(y)[0] for y in (direction, y0))
         projection = NewtonProjection()
-        equations = equations_of(self.constraint, t, y1, args, projection, False, line[None, :])
+        equations = equations_of(self.constraint, t, y1, args, projection, False)
         number = equations.residual(equations.x).size
         if number != 1:
             raise ValueError(
                 f"`constraint` has {number} equations, but relaxation moves along one direction and keeps one invariant. Give "
                 "the one that is not linear (linear ones are kept anyway), or use `mj.Projected(solver, constraint)`."
             )
-        return solve_correction(equations, safe, projection, True)
+        # Pivots must be positive, so the line points to where the invariant grows; `gamma` takes the sign.
+        falls = multiply(equations.normals().jacobian, line) < 0
+        line = jnp.where(falls, -line, line)
+        return solve_correction(equations.along(line[None, :]), safe, projection, True)
 
 
 class _InterpolationFactory(eqx.Module):
@@ -118,7 +122,7 @@ class Relaxation(AbstractStepsOnManifold):
 
     - `solver`: an explicit Runge-Kutta method of Diffrax, such as `Tsit5()`.
     - `constraint`: one equation, in general [`Invariants`][] with one quantity: a convex one, such as most energies
-        and entropies. Elsewhere there may be steps which no `gamma` brings back.
+        and entropies, or a concave one. Elsewhere there may be steps which no `gamma` brings back.
 
     The order is that of the method. Steps may have constant or adaptive sizes. Ends of steps keep all invariants;
     values between the steps are corrected as by [`Projected`][], which keeps the one in `constraint`:
