@@ -2,6 +2,7 @@
 
 import dae_models as models
 import diffrax as dfx
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -476,11 +477,14 @@ def test_numerically_singular():
 
 
 def test_parameters_that_switch_structure():
-    """The example has to have them as they will be used."""
+    """The example has to have them as they will be used. One equation depends on no other."""
     model = lambda t, x, xdot, eps: jnp.stack([xdot[0] + x[0] * x[1], eps * xdot[1] - x[1] + x[0]])
-    with pytest.raises(ValueError, match="depend on each other"):
+    vanishing = r"coefficients of `x\[1\]'` in the equation `F\[1\]`.* are zero"
+    with pytest.raises(ValueError, match=f"{vanishing} there.*`args_example`"):
         mj.reduce_dae(model, jnp.ones(2), 0.0)
     dae = mj.reduce_dae(model, jnp.ones(2), 0.1)
+    with pytest.raises(ValueError, match=f"{vanishing} at the start"):
+        dae.consistent_state(0.0, jnp.ones(2), 0.0)
     assert np.isfinite(dae.terms.vf(0.0, jnp.ones(2), 0.1)).all()
     assert np.isnan(dae.terms.vf(0.0, jnp.ones(2), 0.0)).any()
 
@@ -520,6 +524,19 @@ def test_redundant_constraints():
         RuntimeError, match="`dae.consistent_state`, called outside of `jit`, says which"
     ):
         solve(dae.terms, dae.constraint, z, None, 1.0)
+
+
+@pytest.mark.parametrize("form", ["ode", "index-1"])
+def test_a_derivative_that_is_not_guessed(form):
+    """Where it is zero, as by default, `x'^2 = x` does not determine the next one."""
+    square = lambda t, x, xdot, args: {"e": xdot["x"] ** 2 - x["x"]}
+    dae, x = mj.reduce_dae(square, {"x": 1.0}, form=form), {"x": 1.0}
+    with pytest.raises(ValueError, match=r"where `x'` is zero.*`derivatives=\({'x': 1.0},\)`"):
+        dae.consistent_state(0.0, x, fixed=("x",))
+    with pytest.raises(RuntimeError, match=r"guess of `x'` is zero"):
+        eqx.filter_jit(lambda x: dae.consistent_state(0.0, x, fixed=("x",)))(x)
+    z, _ = dae.consistent_state(0.0, x, fixed=("x",), derivatives=({"x": -0.5},))
+    np.testing.assert_allclose(z, [1.0, -1.0], rtol=1e-14)
 
 
 def test_infeasible_starts(reduced):

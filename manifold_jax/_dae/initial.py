@@ -1,11 +1,10 @@
 """Consistent initial values."""
 
-from typing import Any, NamedTuple
+import dataclasses
 
 import equinox as eqx
 import jax
 import jax.core
-import jax.flatten_util as jfu
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
@@ -14,7 +13,7 @@ from jaxtyping import Array, Float
 
 from .._base.errors import clear_errors, listed
 from .._base.numbers import numbers_as_arrays
-from .._base.types import Args, BoolScalar, FloatScalar, RealScalarLike, Y
+from .._base.types import Args, BoolScalar, FloatScalar, RealScalarLike
 from .._constraint.projection_info import ProjectionInfo
 from .._constraint.residual import as_time, jacobian, row_scale
 from .._constraint.settings import NewtonProjection
@@ -22,88 +21,16 @@ from .._linalg.condition import reciprocal_condition, singular_below
 from .._linalg.dense import gram
 from .._linalg.newton import find_root, implicit_root, without_derivative
 from .._linalg.pivoted import factorize_equilibrated
-from .equations import leaf_names
+from .dependence import Dependence
+from .guess import Guess
 from .highest_derivatives import HighestDerivatives
-from .layout import Gather, StateLayout
 from .nearest import Constrained, depends_on_fixed_only, free_components, nearest_state, with_lifted
 from .reduced import Reduced
-from .samples import dependent_rows
 
 
 _MOST_STEPS = 100
 
-
-class Guess(NamedTuple):
-    """A guess of a state, part of which may be fixed."""
-
-    z: Float[Array, " states"]
-    w: Float[Array, " n"]  # the leading derivatives
-    fixed: tuple[bool, ...]  # for each number of `z`
-    names: tuple[str, ...]  # of the unknowns that are fixed, as given
-
-    @staticmethod
-    def of(system: Reduced, x: Y, derivatives: Any, fixed: Any) -> "Guess":
-        given = [_flat(system, x, "x_guess")]
-        given += [_flat(system, dx, f"derivatives[{k}]") for k, dx in enumerate(derivatives)]
-        layout, every = system.analysis.layout, jnp.concatenate(given)
-        z, w = (
-            _places_in_guess(layout, names, len(given))(every, None)
-            for names in (layout.names, layout.leading_names())
-        )
-        return Guess(z, w, _fixed(system, x, fixed), tuple(fixed))
-
-
-def _places_in_guess(layout: StateLayout, names: np.ndarray, number: int) -> Gather:
-    """Return where each of these numbers is in the `number` guesses of `x, x', ...`: under its own
-    name, or as a derivative of another unknown of which it is an alias."""
-    aliases, n = layout.aliases, len(layout.aliases.root)
-    index, scale = [], []
-    for k, unknown in names.tolist():
-        level = k + aliases.shift[unknown] - aliases.shift
-        (others,) = np.nonzero(
-            (aliases.root == aliases.root[unknown]) & (level >= 0) & (level < number)
-        )
-        other = unknown if unknown in others else next(iter(others), unknown)
-        index.append(level[other] * n + other if other in others else -1)
-        scale.append(aliases.factor[unknown] / aliases.factor[other])
-    return Gather(np.array(index, int), np.array(scale, float))
-
-
-def _flat(system: Reduced, x: Y, name: str) -> Array:
-    leaves, structure = system.equations.shapes
-    x = jtu.tree_map(jnp.asarray, x)
-    shapes = [leaf.shape for leaf in jtu.tree_leaves(x)]
-    if jtu.tree_structure(x) != structure or shapes != [leaf.shape for leaf in leaves]:
-        raise ValueError(
-            f"`{name}` must be like `x_example`, {structure} of shapes {[leaf.shape for leaf in leaves]}; got "
-            f"{jtu.tree_structure(x)} of shapes {shapes}."
-        )
-    floating = jtu.tree_map(
-        lambda leaf, like: leaf.astype(like.dtype), jtu.tree_leaves(x), [*leaves]
-    )
-    return jfu.ravel_pytree(floating)[0]
-
-
-def _fixed(system: Reduced, x: Y, fixed: Any) -> tuple[bool, ...]:
-    if isinstance(fixed, str) or not all(isinstance(name, str) for name in fixed):
-        raise TypeError(
-            f"`fixed` must be a tuple of names, such as ('{system.equations.names.unknowns[0]}',), got {fixed!r}."
-        )
-    names = system.analysis.layout.names.tolist()
-    states = [system.equations.names.derivative(unknown, k) for k, unknown in names]
-    groups = dict(leaf_names(x, "x"))
-    held = np.zeros(len(states), bool)
-    for name in fixed:
-        whole, primes = name.rstrip("'"), len(name) - len(name.rstrip("'"))
-        numbers = [entry + "'" * primes for entry in groups.get(whole, [whole])]
-        missing = [number for number in numbers if number not in states]
-        if missing:
-            raise ValueError(
-                f"`fixed` names {listed(missing)}, not of the state, whose numbers are {listed(states, 20)}. What "
-                "is not in the state follows from it."
-            )
-        held |= np.isin(states, numbers)
-    return tuple(held.tolist())
+_GIVE_DERIVATIVES = "give others by `derivatives`, of an unknown `x` by `derivatives=({'x': 1.0},)`"
 
 
 def consistent_state(
@@ -117,7 +44,7 @@ def consistent_state(
         near = info.residual <= NewtonProjection().tolerance_for(z.dtype)
         cause = jnp.where(info.full_rank, jnp.where(near, 2, 1), 0)
         cause = jnp.where(info.success, 0, cause)
-        z = _raise_unless(info.success, z, cause, tuple(_messages(guess, system.analysis.implicit)))
+        z = _raise_unless(info.success, z, cause, tuple(_messages(guess, leading)))
     return z, info
 
 
@@ -189,23 +116,48 @@ def _solve_leading_equations(
     return implicit_root(leading, found), jax.lax.stop_gradient(small)
 
 
-def _messages(guess: Guess, implicit: bool) -> list[str]:
+def _messages(guess: Guess, leading: HighestDerivatives) -> list[str]:
+    unguessed = _unguessed(leading, guess)
     held = f" with {listed(list(guess.names))} fixed" if guess.names else ""
     advice = " Fix less, or other unknowns." if guess.names else ""
     other_form = (
         ""
-        if implicit
+        if leading.analysis.implicit
         else " If they are independent, but some by less than 1e-8 of the others (diodes at rest), write "
         "`mj.reduce_dae(..., form='index-1')`."
     )
+    zero = f" The guess of {unguessed} is zero; {_GIVE_DERIVATIVES}." if unguessed else ""
     return [
         f"The equations of `F` and their derivatives cannot be satisfied near `x_guess`{held}: they depend on each "
-        f"other there.{advice} Remove equations that follow from others, or start elsewhere.{other_form}",
+        f"other there.{advice} Remove equations that follow from others, or start elsewhere.{zero}{other_form}",
         f"No state near `x_guess` satisfies the equations of `F` and their derivatives{held}.{advice} Start closer, or "
-        "check that they can hold at the same time.",
+        f"check that they can hold at the same time.{zero}",
         "The equations of `F` do not determine all derivatives at the start: some depend on the others there "
-        "(redundant), or it is a singular configuration.",
+        f"(redundant), or it is a singular configuration.{zero}",
     ]
+
+
+def _unguessed(leading: HighestDerivatives, guess: Guess) -> str:
+    """Return the names of the unknown derivatives of which no guess is given, in the order of the state."""
+    layout, equations = leading.analysis.layout, leading.equations
+    names = [layout.names[guess.zero[0]]]
+    if leading.analysis.implicit:
+        names.append(layout.leading_names()[guess.zero[1]])
+    found = np.concatenate(names).tolist()
+    return listed([equations.names.derivative(unknown, k) for k, unknown in found])
+
+
+def _singular_by_guess(leading: HighestDerivatives, guess: Guess) -> bool:
+    """Whether the leading equations are regular with numbers other than zero for the derivatives of which no
+    guess is given."""
+    random = np.random.default_rng(0)
+    z, w = (
+        jnp.where(zero, jnp.asarray(random.normal(size=x.shape), x.dtype), x)
+        for x, zero in zip((leading.z, guess.w), guess.zero, strict=True)
+    )
+    matrix = sp.csr_array(np.asarray(dataclasses.replace(leading, z=z).matrix(w)))
+    regular = reciprocal_condition(matrix) > 10 * singular_below(matrix.dtype)
+    return bool(np.isfinite(matrix.data).all()) and regular
 
 
 def _explain(
@@ -216,17 +168,28 @@ def _explain(
         return
     if bool(info.success) or (any(guess.fixed) and bool(nonsingular)):
         return
-    matrix = sp.csr_array(np.asarray(leading.matrix()))
+    matrix = sp.csr_array(np.asarray(leading.matrix(guess.w)))
     if not np.isfinite(matrix.data).all():
         raise ValueError(
             "`F` or its derivatives are not finite at the start. Give an `x_guess` where they are."
         )
     if reciprocal_condition(matrix) > 10 * singular_below(matrix.dtype):
         return
-    names = leading.equations.names.equations
-    rows = leading.analysis.rows[dependent_rows(matrix)]
+    equations, vanishing = Dependence.of(leading.analysis, matrix)
+    unguessed = _unguessed(leading, guess)
+    if unguessed and _singular_by_guess(leading, guess):
+        raise ValueError(
+            f"The equations {equations} of `F` do not determine the derivatives where {unguessed} is zero, which is the guess "
+            f"if none is given: {_GIVE_DERIVATIVES}."
+        )
+    if vanishing:
+        raise ValueError(
+            f"The coefficients of {vanishing} in the equation {equations} of `F`, differentiated as often as necessary, are zero "
+            "at the start, and do not determine the derivatives. If a parameter in `args` is zero, give another number, or "
+            "write the equation without the terms that vanish (and reduce it again); otherwise start elsewhere."
+        )
     raise ValueError(
-        f"The equations {listed([names[i] for i in rows])} of `F`, differentiated as often as necessary, depend on each "
-        "other at the start: they are redundant (remove one of them), or this is a singular configuration (start "
-        "elsewhere). The derivatives are not determined there."
+        f"The equations {equations} of `F`, differentiated as often as necessary, depend on each other at the start: they "
+        "are redundant (remove one of them), or this is a singular configuration (start elsewhere). The derivatives "
+        "are not determined there."
     )

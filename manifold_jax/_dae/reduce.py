@@ -15,11 +15,11 @@ from .._base.types import Args, Y
 from .._linalg.singular_parts import SingularParts
 from .analysis import Analysis
 from .combined import without_cancellations
+from .dependence import Dependence
 from .equations import Names, ResidualEquations
 from .occurrence import Example, Occurrence
 from .reduced import Reduced
 from .report import DAEReport
-from .samples import dependent_rows
 from .system import ReducedDAE
 
 
@@ -142,12 +142,19 @@ def _structurally_singular(names: Names, occurrence: Occurrence) -> str:
 
 
 def _singular(found: Analysis, report: DAEReport) -> str:
-    rows = found.rows[dependent_rows(found.samples.matrices[0])]
-    names = listed([found.example.equations.names.equations[i] for i in rows])
-    return (
+    equations, vanishing = Dependence.of(found, found.samples.matrices[0])
+    message = (
         f"`F` is structurally regular (index {report.index}, {report.degrees_of_freedom} degrees of freedom), but the "
         f"matrix of its leading derivatives is singular wherever it was evaluated (reciprocal condition "
-        f"{max(found.samples.conditions):.0e} at best): the equations {names} depend on each other there. Either they are "
+        f"{max(found.samples.conditions):.0e} at best): "
+    )
+    if vanishing:
+        return message + (
+            f"the coefficients of {vanishing} in the equation {equations} are zero there. If a parameter in `args_example` is "
+            "zero, give it as it will be used; if it stays zero, or if the terms cancel, write the equation without them."
+        )
+    return message + (
+        f"the equations {equations} depend on each other there. Either they are "
         "redundant, or terms cancel that structure cannot see and the index is higher (a hidden index): combine "
         "those equations so that the cancelled derivatives are gone. For a problem of index 1 with a singular "
         "matrix, M x' = f(t, x), use `mj.MassMatrixTerm` with `mj.Rodas5P`."

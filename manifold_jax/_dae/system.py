@@ -17,7 +17,8 @@ from .._base.types import Args, RealScalarLike, Y
 from .._base.user_functions import check_function
 from .._constraint.projection_info import ProjectionInfo
 from .._rosenbrock import MassMatrixTerm
-from .initial import consistent_state, Guess
+from .guess import Guess
+from .initial import consistent_state
 from .reduced import Reduced, ReducedConstraint
 from .report import DAEReport
 
@@ -75,7 +76,8 @@ class ReducedDAE(eqx.Module):
             not matter.
         - `args`: the parameters.
         - `derivatives`: guesses for `x', x'', ...`, each like `x_guess`, for states that are derivatives
-            without a name of their own; zero if not given.
+            without a name of their own; zero if not given, where equations like `x'^2 = x` do not
+            determine the next derivative.
         - `fixed`: names of fixed unknowns, of whole arrays (`"q"`, of an array alone `"x"`) or
             numbers (`"q[0]"`), with `'` for derivatives, as in `report.states`. Equations for fixed
             unknowns alone have to hold for what is given.
