@@ -358,6 +358,18 @@ def test_known_times_at_the_ends_of_steps(controller, dt0, direction):
     assert sides == [[0, 1], [1, 2]]
 
 
+def test_known_times_have_room_of_their_own():
+    """More of them than `max_resets`, which is for events: the ones here come in between."""
+    dose = mj.ResetAt(jnp.linspace(0.05, 0.95, 7), lambda t, y, args: y + 1.0)
+    full = mj.Reset(lambda t, y, args: y - 2.5, lambda t, y, args: y - 3.0, direction=True)
+    still = dfx.ODETerm(lambda t, y, args: jnp.zeros_like(y))
+    parts = still, dfx.Tsit5(), 0.0, 1.0, 0.25, jnp.zeros(())
+    sol = mj.diffeqsolve(*parts, resets=(dose, full), max_resets=2)
+    assert sol.resets.times.shape == (9,)
+    assert sol.resets.indices.tolist() == [0, 0, 0, 1, 0, 0, 0, 1, 0]
+    assert sol.ys.tolist() == [1.0]
+
+
 def cradle(masses, t1, restitution=1.0):
     """Balls on threads in a row, in contact where they hang; the first is let go."""
     n = masses.size

@@ -97,7 +97,7 @@ def test_an_ensemble_on_disk(tmp_path):
     for index, message in stored.failures():
         assert ensemble.failed[index]
         assert "more events than `max_resets`" in message
-    assert mj.open_ensemble(folder).resets["after"].shape == (SIZE, 5, 2)
+    assert mj.open_ensemble(folder).resets["after"].shape == (SIZE, 5 + 2, 2)  # and for the kicks
 
 
 def test_an_event_ends_each_trajectory():

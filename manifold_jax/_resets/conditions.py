@@ -45,6 +45,10 @@ class Conditions(eqx.Module):
         return max(r.samples if isinstance(r, Reset) else 1 for r in self.resets)
 
     @property
+    def num_known_times(self) -> int:
+        return sum(r.times.size for r in self.resets if isinstance(r, ResetAt))  # pyright: ignore
+
+    @property
     def directions(self) -> list[int]:
         """Return 1 for events where a condition increases, -1 where it decreases, 0 for both."""
         signs = {True: 1, False: -1, None: 0}

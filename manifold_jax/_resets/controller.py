@@ -35,15 +35,15 @@ class ResettingController(dfx.AbstractStepSizeController):
     """A step size controller for a [`Resetting`][] solver."""
 
     controller: dfx.AbstractStepSizeController
-    max_resets: int = eqx.field(static=True)
+    room: int = eqx.field(static=True)
 
     def wrap(self, direction: Any) -> "ResettingController":
-        return ResettingController(self.controller.wrap(direction), self.max_resets)
+        return ResettingController(self.controller.wrap(direction), self.room)
 
     def init(self, terms, t0, t1, y0, dt0, args, func, error_order) -> tuple[Any, ResettingState]:
         first, inner = self.controller.init(terms, t0, t1, y0, dt0, args, func, error_order)
         zero = jnp.zeros_like(t0)
-        record = ResetRecord.empty(self.max_resets, t0, y0)
+        record = ResetRecord.empty(self.room, t0, y0)
         return first, ResettingState(inner, zero, zero, jnp.zeros((), jnp.int32), record)
 
     def adapt_step_size(

@@ -18,15 +18,15 @@ class Resets(eqx.Module):
     **Attributes:**
 
     - `number`: how many there were.
-    - `times`: of the events, shape `(max_resets,)`.
-    - `indices`: which of the `resets` happened, shape `(max_resets,)`.
-    - `before`, `after`: the states before and after, with a leading axis of length `max_resets`. Both are
+    - `times`: of the events, shape `(rows,)`: `max_resets` rows, and one for each time of [`ResetAt`][].
+    - `indices`: which of the `resets` happened, shape `(rows,)`.
+    - `before`, `after`: the states before and after, with a leading axis of length `rows`. Both are
         on the manifold.
     """
 
     number: IntScalar
-    times: Float[Array, " max_resets"]
-    indices: Int[Array, " max_resets"]
+    times: Float[Array, " rows"]
+    indices: Int[Array, " rows"]
     before: Y
     after: Y
 
@@ -35,7 +35,7 @@ class ResetRecord(eqx.Module):
     """The resets so far, in the time of Diffrax."""
 
     number: IntScalar
-    indices: Int[Array, " max_resets"]
+    indices: Int[Array, " rows"]
     rows: Any  # times, states before and states after
 
     @staticmethod

@@ -59,7 +59,7 @@ class Resetting(dfx.AbstractWrappedSolver):
     terminating: TerminatingEvents | None
     t0: FloatScalar  # of the solve, in the time of Diffrax
     end: FloatScalar
-    max_resets: int = eqx.field(static=True)
+    room: int = eqx.field(static=True)
 
     def init(self, terms, t0: RealScalarLike, t1: RealScalarLike, y0: Y, args: Args) -> ResetState:
         return self.starting(self.inner.init(terms, t0, t1, y0, args))
@@ -134,7 +134,7 @@ class Resetting(dfx.AbstractWrappedSolver):
 
         def look() -> Met:
             found = held(find)
-            exhausted = found.ends_step & (jnp.sum(history.happened) >= self.max_resets)
+            exhausted = found.ends_step & (jnp.sum(history.happened) >= self.room)
             jumps = found.ends_step & ~exhausted
             ends = jnp.asarray(t0), jnp.asarray(t1)
             jump = self.jump(terms, jumps, found.number, ends, found.time, y1, memory)

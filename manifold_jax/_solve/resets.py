@@ -62,13 +62,15 @@ def with_resets(
     conditions = Conditions.of(resets, t0, y0, args)
     if setup.throw and any(conditions.is_boolean):
         y0 = eqx.error_if(y0, jnp.any(conditions.true_at_start(t0, y0)), _TRUE_AT_START)
+    # Known times have room of their own, as their number is known.
+    room = max_resets + conditions.num_known_times
     direction = ready.data.direction
     inner = _with_tolerances(run.solver, run.controller)
     terminating = None if event is None else TerminatingEvents(event, args)
     ends = t0 * direction, t1 * direction
-    solver = Resetting(inner, conditions, terminating, *ends, max_resets)
+    solver = Resetting(inner, conditions, terminating, *ends, room)
     state = None if run.solver_state is None else solver.starting(run.solver_state)
-    controller = ResettingController(run.controller, max_resets)
+    controller = ResettingController(run.controller, room)
     saveat = eqx.tree_at(lambda s: (s.solver_state, s.controller_state), run.saveat, (True, True))
     return LoopArguments(solver, controller, saveat, state, y0)
 
