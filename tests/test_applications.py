@@ -810,6 +810,11 @@ def test_objective_without_a_minimum():
         (dict(objective=lambda x, a: jnp.asarray(1)), TypeError, "`objective`.*int"),
         (dict(constraint=lambda t, x, a: x[0]), TypeError, "`constraint`.*mj.Constraint"),
         (dict(constraint=mj.Constraint(lambda t, x, a: jnp.ones(3))), ValueError, "3 residuals"),
+        (
+            dict(constraint=mj.Constraint(lambda t, x, a: x @ x - 1, redundant=True)),
+            ValueError,
+            "`constraint` has `redundant=True`.*independent",
+        ),
         (dict(x0=np.array([1, 0])), TypeError, "`x0`.*int64"),
         (dict(x0=()), ValueError, "`x0` has no array leaves"),
         (dict(tolerance=0.0), ValueError, "`tolerance`.*between 0 and 1"),

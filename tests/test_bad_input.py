@@ -27,6 +27,7 @@ def solve(constraint=CIRCLE, y0=START, args=None, **options):
     [
         (np.array([1, 0]), "`y0`.*int64.*float"),
         ((1, 0), "`y0`.*int.*float"),
+        (jnp.array([1.0, 0.0], jnp.bfloat16), "`y0`.*bfloat16.*too few"),
         (jnp.array([1.0 + 0j, 0.0]), "`y0`.*complex.*z.real, z.imag"),
         (jnp.array([True, False]), "`y0`.*bool"),
         (["a"], "`y0`.*real arrays"),

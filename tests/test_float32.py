@@ -87,6 +87,21 @@ def test_projection_tolerance_follows_the_type():
     np.testing.assert_allclose(np.sum(np.square(p)), 1, atol=3e-7)
 
 
+def test_default_tolerances_of_applications():
+    """A curve has a fold and a flow a minimum, without a warning of tolerances that nobody gave."""
+    fold = lambda x, args: x[:1] - x[:1] ** 3 / 3 - x[1:]
+    bowl = lambda x, args: x @ (jnp.array([1.0, 3.0, 7.0], x.dtype) * x) + 0.3 * x[0]
+    sphere = mj.Constraint(lambda t, x, args: x @ x - 1)
+    start, up = single((jnp.array([-2.0, 2 / 3]), jnp.array([-0.48, 0.6, 0.64])))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        trace = mj.trace_curve(fold, start, length=3.0, direction=-1)
+        least = mj.gradient_flow(bowl, sphere, up)
+    np.testing.assert_allclose(trace.turning_points[0], [-1.0, -2 / 3], atol=1e-6)
+    np.testing.assert_allclose(least.x, [-1.0, 0.0, 0.0], atol=1e-6)
+    assert least.stats["num_steps"] < 60
+
+
 def test_tolerances_below_rounding():
     """They made steps of rounding size until `max_steps`, or an error that was none."""
     still = dfx.ODETerm(lambda t, y, args: -y)

@@ -14,7 +14,7 @@ from .._adjoint import StepReplayAdjoint
 from .._base.closure import convert_closure
 from .._base.compat import nonlinear_failure
 from .._base.errors import clear_errors
-from .._base.numbers import numbers_as_arrays
+from .._base.numbers import by_precision, numbers_as_arrays
 from .._base.types import Args, IntScalar, RealScalarLike
 from .._constraint.checks import check_state
 from .checks import as_curve_start, as_direction, check_counts, check_function, raise_if_failed
@@ -73,8 +73,8 @@ def trace_curve(
     points: int = 201,
     direction: Any = 1,
     solver: dfx.AbstractSolver | None = None,
-    rtol: RealScalarLike = 1e-8,
-    atol: RealScalarLike = 1e-8,
+    rtol: RealScalarLike | None = None,
+    atol: RealScalarLike | None = None,
     max_steps: int = 4096,
     parameter: int = -1,
     max_turning_points: int = 16,
@@ -97,8 +97,8 @@ def trace_curve(
     - `direction`: a vector like `x0`, with a positive component along the curve; or 1 or -1
         for `x[parameter]` increasing or decreasing at first.
     - `solver`: a Runge-Kutta solver of Diffrax, by default `Tsit5()`.
-    - `rtol`, `atol`: of the steps. The points are on the curve to round-off anyway; this is
-        the error of the arclength.
+    - `rtol`, `atol`: of the steps, by default 1e-8 (1e-5 in single precision). The points are on the
+        curve to round-off anyway; this is the error of the arclength.
     - `max_steps`: the most steps.
     - `parameter`: the component whose turning points are reported.
     - `max_turning_points`: room for them.
@@ -140,6 +140,7 @@ def trace_curve(
     arclengths = jnp.linspace(0, jnp.where(positive, length, 1), points, dtype=x0.dtype)
     solver = dfx.Tsit5() if solver is None else solver
     adjoint = StepReplayAdjoint() if adjoint is None else adjoint
+    rtol, atol = (by_precision(given, x0.dtype, 1e-8, 1e-5) for given in (rtol, atol))
     # A straight piece has no error that limits the steps, and a step that leaps over two crossings
     # would notice neither.
     controller = dfx.PIDController(rtol, atol, dtmax=arclengths[-1] / 50)

@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float
 from .._base.closure import convert_closure
 from .._base.compat import is_okay, nonlinear_failure
 from .._base.errors import clear_errors
-from .._base.numbers import numbers_as_arrays
+from .._base.numbers import by_precision, numbers_as_arrays
 from .._base.types import Args, BoolScalar, FloatScalar, RealScalarLike, Y
 from .._constraint.checks import check_constraint, check_constraint_type, check_state
 from .._constraint.constraint import AbstractConstraint, Constraint
@@ -88,9 +88,9 @@ def gradient_flow(
     *,
     t1: RealScalarLike = 1e6,
     solver: dfx.AbstractSolver | None = None,
-    rtol: RealScalarLike = 1e-6,
-    atol: RealScalarLike = 1e-6,
-    tolerance: float = 1e-8,
+    rtol: RealScalarLike | None = None,
+    atol: RealScalarLike | None = None,
+    tolerance: float | None = None,
     max_steps: int | None = 4096,
     throw: bool = True,
 ) -> ConstrainedMinimum:
@@ -109,18 +109,19 @@ def gradient_flow(
     **Arguments:**
 
     - `objective`: `f(x, args)`, one number.
-    - `constraint`: an [`mj.Constraint`][], `g(t, x, args)`; evaluated at `t = 0`.
+    - `constraint`: an [`mj.Constraint`][], `g(t, x, args)`; evaluated at `t = 0`. Its equations must be
+        independent: `redundant=True` is refused.
     - `x0`: a point that satisfies the constraint, any pytree of real arrays.
     - `args`: passed to both.
     - `t1`: the time after which to give up. Time is in units of 1 / curvature of `f`.
     - `solver`: a Diffrax solver, by default `Kvaerno3()`. The flow is stiff near a minimum:
         an explicit method takes about as many steps as the curvatures differ by, and its
         errors of size `rtol` keep the gradient from falling below `tolerance`.
-    - `rtol`, `atol`: the tolerances of the steps. They decide which basin is reached from
-        a start near its edge, not the accuracy of the result.
+    - `rtol`, `atol`: the tolerances of the steps, by default 1e-6 (1e-4 in single precision). They
+        decide which basin is reached from a start near its edge, not the accuracy of the result.
     - `tolerance`: the flow ends where `max_j |P grad f| <= tolerance max_j |grad f|`, with
-        `grad f` there or at `x0`, whichever is larger. Newton's method may then move the
-        point by at most `sqrt(tolerance) (|x| + 1)`, otherwise it is left where it is.
+        `grad f` there or at `x0`, whichever is larger; by default 1e-8 (1e-5 in single
+        precision). Newton's method may then move the point by at most `sqrt(tolerance) (|x| + 1)`, otherwise it is left where it is.
     - `max_steps`: the most steps of the flow.
     - `throw`: raise if no stationary point is found. Otherwise look at `result`.
 
@@ -145,10 +146,16 @@ def gradient_flow(
     check_state(x0, "x0")
     x0 = jtu.tree_map(jnp.asarray, x0)
     check_constraint(constraint, 0.0, x0, args)
+    if constraint.redundant:
+        raise ValueError(
+            "`constraint` has `redundant=True`, but multipliers are unique only for independent equations. Leave out those "
+            "that follow from others, and `redundant`."
+        )
     check_function("objective", objective, (), "e.g. `jnp.sum(...)`", x0, args)
+    start, unravel = jfu.ravel_pytree(x0)
+    tolerance = by_precision(tolerance, start.dtype, 1e-8, 1e-5)
     if not 0 < tolerance < 1:
         raise ValueError(f"`tolerance` must be between 0 and 1, got {tolerance}.")
-    start, unravel = jfu.ravel_pytree(x0)
     lagrangian = Lagrangian(
         convert_closure(lambda x, args: objective(unravel(x), args), start, args),
         convert_closure(
@@ -159,6 +166,7 @@ def gradient_flow(
     fixed, start = without_derivative((lagrangian, start))
     faults = _start_faults(fixed, start)
     solver = dfx.Kvaerno3() if solver is None else solver
+    rtol, atol = (by_precision(given, start.dtype, 1e-6, 1e-4) for given in (rtol, atol))
     options = dict(stepsize_controller=dfx.PIDController(rtol, atol), max_steps=max_steps)
     sol, size = _descend(fixed, start, t1, solver, tolerance, options)
 

@@ -13,6 +13,7 @@ import jax.tree_util as jtu
 
 
 Function = TypeVar("Function", bound=Callable)
+Number = TypeVar("Number")
 
 
 def numbers_as_arrays(*names: str, times: tuple[str, ...] = ()) -> Callable[[Function], Function]:
@@ -50,6 +51,11 @@ def _checked(name: str, tree: Any) -> Any:
             f"or register it: `@jax.tree_util.register_dataclass` above `@dataclasses.dataclass`."
         )
     return tree
+
+
+def by_precision(given: Number | None, dtype: Any, double: float, single: float) -> Number | float:
+    """Return a tolerance, or if none is given the default for numbers of this type."""
+    return (double if dtype == jnp.float64 else single) if given is None else given
 
 
 def with_arrays(tree: Any) -> Any:

@@ -36,6 +36,11 @@ def check_state(y: Y, name: str = "y0") -> None:
                 f"`{name}` has a leaf of type {dtype}, which cannot be moved onto a manifold. "
                 f"Convert it: `{name} = jax.tree.map(lambda leaf: jnp.asarray(leaf, float), {name})`."
             )
+        if jnp.finfo(dtype).bits < 32:
+            raise TypeError(
+                f"`{name}` has a leaf of type {dtype}, whose two or three digits are too few for points on a manifold. "
+                f"Convert it: `{name} = jax.tree.map(lambda leaf: jnp.asarray(leaf, float), {name})`."
+            )
 
 
 def check_leaves(y: Y, name: str) -> None:

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 
+from .._base.numbers import by_precision
 from .._resets.reset import check_resets
 from .data import check_times, make_records
 from .model import as_function_of_constraint, Simulator
@@ -151,10 +152,10 @@ def fit(
     solver = as_function_of_constraint(solver)
     transform = make_transform(parameters, bounds, positive)
     if stepsize_controller is None:
-        tolerance = _by_precision(1e-8, 1e-5)
+        tolerance = by_precision(None, jnp.result_type(float), 1e-8, 1e-5)
         stepsize_controller = dfx.PIDController(rtol=tolerance, atol=tolerance)
     if optimizer is None:
-        tolerance = _by_precision(1e-7, 1e-3)
+        tolerance = by_precision(None, jnp.result_type(float), 1e-7, 1e-3)
         optimizer = optx.LevenbergMarquardt(rtol=tolerance, atol=tolerance)
     check_resets(resets, max_resets, None)
     solves = solver, stepsize_controller, dt0, tuple(resets), max_steps, max_resets
@@ -207,7 +208,3 @@ def _unknowns(objective: Any, options: Options) -> list[Any]:
         )
     drawn = np.pad(draw_points(transform, options.starts, options.seed), ((0, 0), (0, states)))
     return [jnp.asarray(u, transform.start.dtype) for u in drawn]
-
-
-def _by_precision(double: float, single: float) -> float:
-    return double if jnp.result_type(float) == jnp.float64 else single
