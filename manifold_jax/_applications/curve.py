@@ -140,13 +140,13 @@ def trace_curve(
     arclengths = jnp.linspace(0, jnp.where(positive, length, 1), points, dtype=x0.dtype)
     solver = dfx.Tsit5() if solver is None else solver
     adjoint = StepReplayAdjoint() if adjoint is None else adjoint
-    rtol, atol = (by_precision(given, x0.dtype, 1e-8, 1e-5) for given in (rtol, atol))
+    tolerances = [by_precision(given, x0.dtype, 1e-8, 1e-5) for given in (rtol, atol)]
     # A straight piece has no error that limits the steps, and a step that leaps over two crossings
     # would notice neither.
-    controller = dfx.PIDController(rtol, atol, dtmax=arclengths[-1] / 50)
+    controller = dfx.PIDController(*tolerances, dtmax=arclengths[-1] / 50)
     options = dict(stepsize_controller=controller, max_steps=max_steps, adjoint=adjoint)
     sol, nodes = follow(curve, start, arclengths, solver, options)
-    used, smooth = unbroken(nodes, rtol, atol)
+    used, smooth = unbroken(nodes, *tolerances)
     usable = positive & ~jnp.any(faults)
     used = jnp.where(usable, used, 0)
     turns = find_turns(curve, sol.interpolation, nodes, used, parameter, max_turning_points)  # pyright: ignore[reportArgumentType]

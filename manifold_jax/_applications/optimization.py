@@ -166,8 +166,8 @@ def gradient_flow(
     fixed, start = without_derivative((lagrangian, start))
     faults = _start_faults(fixed, start)
     solver = dfx.Kvaerno3() if solver is None else solver
-    rtol, atol = (by_precision(given, start.dtype, 1e-6, 1e-4) for given in (rtol, atol))
-    options = dict(stepsize_controller=dfx.PIDController(rtol, atol), max_steps=max_steps)
+    tolerances = [by_precision(given, start.dtype, 1e-6, 1e-4) for given in (rtol, atol)]
+    options = dict(stepsize_controller=dfx.PIDController(*tolerances), max_steps=max_steps)
     sol, size = _descend(fixed, start, t1, solver, tolerance, options)
 
     usable = ~jnp.any(faults)

@@ -21,7 +21,7 @@ from .._linalg.condition import reciprocal_condition, singular_below
 from .._linalg.dense import gram
 from .._linalg.newton import find_root, implicit_root, without_derivative
 from .._linalg.pivoted import factorize_equilibrated
-from .dependence import Dependence
+from .dependent_equations import DependentEquations
 from .guess import Guess
 from .highest_derivatives import HighestDerivatives
 from .nearest import Constrained, depends_on_fixed_only, free_components, nearest_state, with_lifted
@@ -175,7 +175,7 @@ def _explain(
         )
     if reciprocal_condition(matrix) > 10 * singular_below(matrix.dtype):
         return
-    equations, vanishing = Dependence.of(leading.analysis, matrix)
+    equations, vanishing = DependentEquations.of(leading.analysis, matrix)
     unguessed = _unguessed(leading, guess)
     if unguessed and _singular_by_guess(leading, guess):
         raise ValueError(

@@ -15,7 +15,7 @@ from .._base.types import Args, Y
 from .._linalg.singular_parts import SingularParts
 from .analysis import Analysis
 from .combined import without_cancellations
-from .dependence import Dependence
+from .dependent_equations import DependentEquations
 from .equations import Names, ResidualEquations
 from .occurrence import Example, Occurrence
 from .reduced import Reduced
@@ -142,7 +142,7 @@ def _structurally_singular(names: Names, occurrence: Occurrence) -> str:
 
 
 def _singular(found: Analysis, report: DAEReport) -> str:
-    equations, vanishing = Dependence.of(found, found.samples.matrices[0])
+    equations, vanishing = DependentEquations.of(found, found.samples.matrices[0])
     message = (
         f"`F` is structurally regular (index {report.index}, {report.degrees_of_freedom} degrees of freedom), but the "
         f"matrix of its leading derivatives is singular wherever it was evaluated (reciprocal condition "
