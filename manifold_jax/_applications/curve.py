@@ -140,7 +140,8 @@ def trace_curve(
     arclengths = jnp.linspace(0, jnp.where(positive, length, 1), points, dtype=x0.dtype)
     solver = dfx.Tsit5() if solver is None else solver
     adjoint = StepReplayAdjoint() if adjoint is None else adjoint
-    tolerances = [by_precision(given, x0.dtype, 1e-8, 1e-5) for given in (rtol, atol)]
+    default = x0.dtype, 1e-8, 1e-5
+    tolerances = by_precision(rtol, *default), by_precision(atol, *default)
     # A straight piece has no error that limits the steps, and a step that leaps over two crossings
     # would notice neither.
     controller = dfx.PIDController(*tolerances, dtmax=arclengths[-1] / 50)

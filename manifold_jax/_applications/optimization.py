@@ -166,7 +166,8 @@ def gradient_flow(
     fixed, start = without_derivative((lagrangian, start))
     faults = _start_faults(fixed, start)
     solver = dfx.Kvaerno3() if solver is None else solver
-    tolerances = [by_precision(given, start.dtype, 1e-6, 1e-4) for given in (rtol, atol)]
+    default = start.dtype, 1e-6, 1e-4
+    tolerances = by_precision(rtol, *default), by_precision(atol, *default)
     options = dict(stepsize_controller=dfx.PIDController(*tolerances), max_steps=max_steps)
     sol, size = _descend(fixed, start, t1, solver, tolerance, options)
 
