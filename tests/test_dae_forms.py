@@ -275,6 +275,18 @@ def test_derivatives_do_not_count_in_the_error(solver, most_steps):
     )
     np.testing.assert_allclose(sol.ys[:, 0], reference.y[0], atol=2e-7)
     assert sol.stats["num_steps"] < most_steps
+    # Derivatives are what follows from the equations, not what the steps left: errors of 1e-7 A before.
+    x, xdot = dae.outputs(ts, sol.ys)
+    law = jax.vmap(F, (0, 0, 0, None))(ts, x, xdot, None)
+    np.testing.assert_allclose(jnp.stack(law), 0, atol=1e-14)
+
+
+def test_derivatives_in_which_equations_are_nonlinear_count():
+    """Friction that saturates: the stages of a step need the derivative."""
+    friction = lambda t, x, xdot, a: xdot + 1e-3 * jnp.arcsinh(1e6 * xdot) + x - jnp.cos(20 * t)
+    dae = mj.reduce_dae(friction, jnp.zeros(()), form="index-1")
+    error = jnp.array([1.0, 2.0])
+    np.testing.assert_array_equal(dae.terms.counted_error(error), error)
 
 
 def test_index_one_on_the_manifold():

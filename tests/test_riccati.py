@@ -9,6 +9,7 @@ import pytest
 import scipy.linalg
 
 import manifold_jax as mj
+from manifold_jax._applications.riccati import solve_riccati
 
 
 def _field(rates, t, y, inputs):
@@ -78,6 +79,18 @@ def test_derivatives_over_a_long_interval():
     slope = 1 + 9.81 / np.sqrt(9.81**2 + 100)
     assert jax.grad(gain)(9.81) == pytest.approx(slope, rel=1e-10)
     assert jax.jvp(gain, (9.81,), (1.0,))[1] == pytest.approx(slope, rel=1e-10)
+
+
+def test_intervals_of_different_lengths_in_single_precision():
+    """A short interval is not divided as a long one needs it; where rounding would be felt nothing is returned."""
+
+    def first(length):
+        one = jnp.ones((3, 1, 1), jnp.float32)
+        ts = jnp.array([0.0, 1.0, 1.0 + length], jnp.float32)
+        return solve_riccati(ts, one, one, one, jnp.zeros((1, 1), jnp.float32))[0, 0, 0]
+
+    assert first(1e4) == pytest.approx(1 + np.sqrt(2), rel=1e-5)
+    assert np.isnan(first(1e6))
 
 
 def test_growth_that_costs_nothing():

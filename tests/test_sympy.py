@@ -227,6 +227,10 @@ def test_special_functions_and_their_derivatives():
     values = [f(x) for f in functions] + [f(x).diff(x) for f in functions]
     expected = [float(value.subs(x, sm.Float("0.7", 30)).evalf()) for value in values]
     assert_close(model.function(sm.Matrix(values))(0.0, y, {}), expected)
+    below = np.array([-1.3]), np.zeros(1)
+    assert_close(
+        model.function(sm.factorial(x))(0.0, below, {}), float(sm.gamma(sm.Float("-0.3", 30)))
+    )
     with refused(ValueError, "contain `besselj`, `zeta`, for which there is no function of JAX"):
         model.function(sm.besselj(0, x) + sm.zeta(x))
 

@@ -65,6 +65,18 @@ def test_springs_and_servo_motors_oscillate_about_angles_beyond_half_a_turn():
         np.testing.assert_allclose(part, other, rtol=1e-6)
 
 
+def test_forces_of_joints_beyond_half_a_turn():
+    """What a hinge does to a body beside its axis, on which a spring alone acts: along its path `m l x''`."""
+    body = mb.Body("b", 1.0, INERTIA, position=(1.0, 0.0))
+    hinge = mb.Revolute(mb.GROUND, "b", at=(0.0, 0.0), name="h")
+    joints = mb.JointCoordinates(mb.Assembly([body], [hinge], [mb.JointSpring("h", 5.0)]))
+    angles = jnp.array([2.0, 4.0, 9.7])
+    forces = joints.joint_forces(0.0, (angles[:, None], jnp.zeros((3, 1))))
+    along = jnp.stack([-jnp.sin(angles), jnp.cos(angles)], axis=1)
+    found = jnp.sum(along * forces["h"].force, axis=1)
+    np.testing.assert_allclose(found, -5.0 * angles / (INERTIA + 1.0), rtol=1e-12)
+
+
 def test_at_rest_beyond_half_a_turn():
     """The equilibrium of a spring, and the frequency of small motions about it."""
     joints = mb.JointCoordinates(wheels([mb.JointSpring("shaft a", 5.0, 4.0), servo(12.0, -9.0)]))

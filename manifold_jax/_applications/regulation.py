@@ -34,8 +34,8 @@ _NO_EFFECT = (
     "`mb.Assembly(..., [mb.Controller(joints, lambda t, y, args: args)])`."
 )
 _DIVERGED = (
-    "The Riccati equation cannot be solved from t = {t:.6g} on backwards: until the next time an unstable motion without cost "
-    "grows too much, or the weights are too far apart. Give it `state_weights`, or more times."
+    "The Riccati equation cannot be solved from t = {t:.6g} on backwards: until the next time an unstable motion without cost, "
+    "or one that no input reaches, grows too much, or the fastest motions are too fast. Give it `state_weights`, or more times."
 )
 
 

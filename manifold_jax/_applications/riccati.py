@@ -9,15 +9,15 @@ from jaxtyping import Array, Float
 
 # Twice as many steps each time: enough for intervals 4e9 times longer than the fastest motion.
 _DOUBLINGS = 32
-# What rounding may change of the solution.
-_ROUNDING = 1e-4
+# What rounding may change of the solution, and of motions that are slow beside the fastest.
+_ROUNDING, _ROUNDING_OF_SLOW = 1e-4, 1e-2
 
 
 class _Step(NamedTuple):
-    """States and costates over a length of time, `x1 = transition x0 - effort costate1` and
-    `costate0 = cost x0 + transition^T costate1`. `effort` and `cost` are symmetric and not negative."""
+    """States and costates over a length of time, `x1 = (1 + change) x0 - effort costate1` and
+    `costate0 = cost x0 + (1 + change)^T costate1`. `effort` and `cost` are symmetric and not negative."""
 
-    transition: Float[Array, "*intervals d d"]
+    change: Float[Array, "*intervals d d"]
     effort: Float[Array, "*intervals d d"]
     cost: Float[Array, "*intervals d d"]
 
@@ -44,8 +44,9 @@ def solve_riccati(
     step = _over_intervals(jnp.diff(ts), mean(A), mean(push), mean(Q))
 
     def back(S: Array, step: _Step) -> tuple[Array, Array]:
-        controlled = jnp.linalg.solve(_plus_one(step.effort @ S), step.transition)
-        S = _symmetric(step.cost + step.transition.T @ S @ controlled)
+        transition = _plus_one(step.change)
+        controlled = jnp.linalg.solve(_plus_one(step.effort @ S), transition)
+        S = _symmetric(step.cost + transition.T @ S @ controlled)
         return S, S
 
     final = _symmetric(final)
@@ -61,20 +62,24 @@ def _over_intervals(
 ) -> _Step:
     """Double a short step of each interval until it is the interval."""
     H, units = jax.vmap(_hamiltonian)(lengths, A, push, Q)
-    size = jax.lax.stop_gradient(jnp.max(jnp.sum(jnp.abs(H), axis=1), initial=0))
+    size = jax.lax.stop_gradient(jnp.max(jnp.sum(jnp.abs(H), axis=1), axis=1, initial=0))
     number = jnp.clip(jnp.ceil(jnp.log2(size)), 0, _DOUBLINGS)
-    step = jax.vmap(_short_step)(H / 2**number, units)
+    step = jax.vmap(_short_step)(H / 2 ** number[:, None, None], units)
 
-    def twice(carry: tuple[_Step, Array]) -> tuple[_Step, Array]:
+    def twice(carry: tuple[_Step, Array], k: Array) -> tuple[_Step, Array]:
         step = jax.vmap(_twice)(carry[0])
-        return step, jnp.maximum(carry[1], jax.vmap(_growth)(step))
+        new = step, jnp.maximum(carry[1], jax.vmap(_growth)(step))
+        choose = jax.vmap(lambda more, new, old: jnp.where(more, new, old))
+        return jax.tree.map(lambda new, old: choose(k < number, new, old), new, carry)
 
     def body(carry: tuple[_Step, Array], k: Array) -> tuple[tuple[_Step, Array], None]:
-        return jax.lax.cond(k < number, twice, lambda carry: carry, carry), None
+        goes_on = k < jnp.max(number, initial=0)
+        return jax.lax.cond(goes_on, twice, lambda carry, k: carry, carry, k), None
 
     start = step, jax.vmap(_growth)(step)
     (step, growth), _ = jax.lax.scan(body, start, jnp.arange(_DOUBLINGS, dtype=number.dtype))
-    lost = ~(growth * jnp.finfo(growth.dtype).eps < _ROUNDING)
+    rounding = jnp.finfo(growth.dtype).eps
+    lost = ~((growth * rounding < _ROUNDING) & (2**number * rounding < _ROUNDING_OF_SLOW))
     return step._replace(cost=jnp.where(lost[:, None, None], jnp.nan, step.cost))
 
 
@@ -97,23 +102,28 @@ def _short_step(H: Float[Array, "two_d two_d"], unit: Float[Array, ""]) -> _Step
     flow = jax.scipy.linalg.expm(H, max_squarings=0)
     back = jnp.linalg.inv(flow[d:, d:])
     effort, cost = -flow[:d, d:] @ back / unit, -back @ flow[d:, :d] * unit
-    return _Step(back.T, _symmetric(effort), _symmetric(cost))
+    return _Step(back.T - jnp.eye(d, dtype=back.dtype), _symmetric(effort), _symmetric(cost))
 
 
 def _twice(step: _Step) -> _Step:
-    transition, effort, cost = step
-    both = jnp.concatenate([transition, effort], axis=1)
-    controlled, felt = jnp.split(jnp.linalg.solve(_plus_one(effort @ cost), both), 2, axis=1)
+    """Return the step of twice the length. Of the transition only what differs from the identity is kept, which is
+    rounded less while steps are short."""
+    change, effort, cost = step
+    transition, mixed = _plus_one(change), effort @ cost
+    both = jnp.concatenate([mixed, effort], axis=1)
+    held, felt = jnp.split(jnp.linalg.solve(_plus_one(mixed), both), 2, axis=1)
+    controlled = change - held @ transition
     return _Step(
-        transition @ controlled,
+        change + transition @ controlled,
         _symmetric(effort + transition @ felt @ transition.T),
-        _symmetric(cost + transition.T @ cost @ controlled),
+        _symmetric(cost + transition.T @ cost @ _plus_one(controlled)),
     )
 
 
 def _growth(step: _Step) -> Float[Array, ""]:
     """Return by how much squares grow, whatever the units of the coordinates."""
-    return _largest(step.transition * step.transition.T)
+    transition = _plus_one(step.change)
+    return _largest(transition * transition.T)
 
 
 def _largest(matrix: Float[Array, "d d"]) -> Float[Array, ""]:

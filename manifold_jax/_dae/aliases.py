@@ -102,7 +102,7 @@ def lifted(example: Example, aliases: Aliases, structure: DAEStructure) -> DAESt
     """Return the structure with the fewest differentiations in which the equations with `c_i = 0`, too,
     are linear in the leading derivatives."""
     belongs_to = np.argsort(structure.transversal)
-    while (found := _nonlinear(example, aliases, structure)).any():
+    while (found := nonlinear_derivatives(example, aliases, structure)).any():
         at_least = structure.c.copy()
         at_least[belongs_to[found]] += 1
         raised = DAEStructure.of(structure.sigma, at_least)
@@ -111,7 +111,9 @@ def lifted(example: Example, aliases: Aliases, structure: DAEStructure) -> DAESt
     return structure
 
 
-def _nonlinear(example: Example, aliases: Aliases, structure: DAEStructure) -> np.ndarray:
+def nonlinear_derivatives(
+    example: Example, aliases: Aliases, structure: DAEStructure
+) -> np.ndarray:
     """Return which leading derivatives occur nonlinearly in equations that are not differentiated."""
     levels = structure.d[aliases.columns] - aliases.shift
     (unknowns,) = np.nonzero((levels >= 0) & (levels <= example.equations.order))

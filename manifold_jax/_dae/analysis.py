@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 
 from .._base.types import Args
 from .._linalg.sparse import SMALLEST, Sparsity, sparsity_of_any, SquarePattern
-from .aliases import Aliases, lifted
+from .aliases import Aliases, lifted, nonlinear_derivatives
 from .block_elimination import Elimination
 from .compressed import Compressed
 from .derivatives import pick, total_derivatives
@@ -63,6 +63,15 @@ class Analysis:
     def rows(self) -> np.ndarray:
         """The equations that are left."""
         return self.layout.aliases.rows
+
+    @functools.cached_property
+    def controlled(self) -> np.ndarray:
+        """Which numbers of the state of the form of index 1 count in the error of a step: not the derivatives in
+        which the equations are linear. What these are wrong by shows in what they are derivatives of."""
+        order, _ = self.layout.leading_names().T
+        nonlinear = nonlinear_derivatives(self.example, self.layout.aliases, self.layout.structure)
+        states = np.ones(self.layout.num_states, bool)
+        return np.concatenate([states, (order == 0) | nonlinear])
 
     @functools.cached_property
     def samples(self) -> Samples:

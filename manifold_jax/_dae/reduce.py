@@ -75,8 +75,8 @@ def reduce_dae(
     - `form`: `"ode"` solves for the derivatives, for any solver. `"index-1"` leaves the equations for
         them to [`Rodas5P`][] or [`RadauIIA5`][], as unknowns of their own after the state: for stiff equations, and
         where they are nonlinear in their highest derivatives or multipliers (friction, diodes),
-        which then need not become states. Those that are derivatives of unknowns do not count in the
-        error of a step.
+        which then need not become states. Derivatives of unknowns do not count in the error
+        of a step where the equations are linear in them.
 
     **Returns:**
 

@@ -15,7 +15,7 @@ from .._base.types import Args, BoolScalar, RealScalarLike, Y
 from .._constraint.checks import check_state
 from .._constraint.constraint import AbstractConstraint
 from .._constraint.residual import as_time
-from .._linalg.newton import implicit_root
+from .._linalg.newton import implicit_root, without_derivative
 from .analysis import Analysis
 from .equations import ResidualEquations
 from .highest_derivatives import HighestDerivatives
@@ -90,7 +90,13 @@ class Reduced(eqx.Module):
         """Return `x, x', ...` up to derivative `number`, by differentiating along the solution."""
         layout = self.analysis.layout
         z, w = self.split(y)
-        w = self.leading_equations(t, z, args).solve() if w is None else w
+        equations = self.leading_equations(t, z, args)
+        if w is None:
+            w = equations.solve()
+        else:
+            # Those in which equations are linear do not count in the errors of steps: here these hold.
+            fixed, w = without_derivative((equations, w))
+            w = w - fixed.linearize(w).solve(fixed.residual(w))
 
         def leading(t: Array, z: Array) -> Array:
             """Return the leading derivatives as a function, without solving for them again."""

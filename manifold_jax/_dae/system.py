@@ -41,14 +41,9 @@ class ReducedDAE(eqx.Module):
         analysis = self.system.analysis
         if not analysis.implicit:
             return dfx.ODETerm(self.system.field)
-        states = np.ones(analysis.layout.num_states)
-        leading, _ = analysis.layout.leading_names().T
-        return MassMatrixTerm(
-            self.system.field,
-            np.concatenate([states, np.zeros(len(leading))]),
-            # Derivatives are no unknowns of the user's: what they are wrong by shows in what they are derivatives of.
-            controlled=np.concatenate([states == 1, leading == 0]),
-        )
+        numbers = [analysis.layout.num_states, len(analysis.c)]
+        mass = np.repeat([1.0, 0.0], numbers)
+        return MassMatrixTerm(self.system.field, mass, controlled=analysis.controlled)
 
     @property
     def constraint(self) -> ReducedConstraint:

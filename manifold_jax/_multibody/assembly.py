@@ -30,7 +30,7 @@ from .picture import draw_outline, new_axes, outline_of, write_film
 from .reading import Energy, JointForce, Motion, over_times, Times
 from .rotors import group_rotors, Rotors
 from .start import make_state
-from .system import check_for_poses, ConstantAssembly, system_of
+from .system import system_in_poses
 
 
 class Assembly(eqx.Module):
@@ -109,9 +109,7 @@ class Assembly(eqx.Module):
 
         **Raises** `ValueError` for [`RotorInertia`][], [`Coupling`][], bodies without mass, and springs, servo motors and
         stops of hinges that reach beyond half a turn: use [`JointCoordinates`][]."""
-        check_for_poses(self)
-        rows = None if self.independent is None else self.independent.rows
-        return system_of(ConstantAssembly(self), self.redundant and rows is None, rows)
+        return system_in_poses(self)
 
     def without_dependent_equations(self) -> "Assembly":
         """Return the assembly with as many equations of its joints as are independent, for closed loops whose
@@ -226,7 +224,7 @@ class Assembly(eqx.Module):
     ) -> dict[str, JointForce]:
         """Return force and torque of every joint on its second body, from the multipliers, at the time
         `t` or the times of all states. With `redundant` joints only the sum over those that depend on
-        each other is determined."""
+        each other is determined. Springs of hinges beyond half a turn: use that of [`JointCoordinates`][]."""
         if y[0].position.ndim == 2:
             return find_joint_forces(self, t, y, args)
         times = jnp.broadcast_to(floating(t), y[0].position.shape[:1])

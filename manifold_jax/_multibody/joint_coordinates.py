@@ -13,12 +13,13 @@ from .._linalg.dense import factorize_positive
 from .._mechanics import MechanicalConstraint, MechanicalSystem
 from .assembly import Assembly
 from .bodies import Pose
-from .checks import is_concrete
+from .checks import floating, is_concrete
 from .contact_loads import StopLaws
 from .energy import energy_of
 from .frames import Frames
+from .joint_forces import find_joint_forces
 from .loads import JointLoads
-from .reading import Energy
+from .reading import Energy, JointForce, Times
 from .rotors import names_of
 from .spanning_tree import find_spanning_tree, SpanningTree
 from .start import CLOSED
@@ -45,7 +46,7 @@ class JointCoordinates(eqx.Module):
     hook = mj.Projected(dfx.Dopri8(), joints.constraint)
     sol = mj.diffeqsolve(joints.terms, hook, 0.0, 1.0, 0.01, joints.state(), ...)
     robot.gaps(joints.poses(sol.ys)[0])  # also motion, point, draw, animate
-    joints.energy(sol.ys)
+    joints.energy(sol.ys)  # also joint_forces
     ```
 
     `q` has far fewer numbers than the poses of all bodies, and the joints of the tree hold by construction: a robot
@@ -156,6 +157,18 @@ class JointCoordinates(eqx.Module):
         if y[0].ndim > 1:
             return jax.vmap(self.energy)(y)
         return energy_of(self.assembly, self.poses(y), self._motion.coordinates.known(y[0]))
+
+    def joint_forces(self, t: Times, y: State, args: Args = None) -> dict[str, JointForce]:
+        """Return force and torque of every joint on its second body, as
+        [`Assembly.joint_forces`][manifold_jax.multibody.Assembly.joint_forces], with the angles of springs, servo motors
+        and stops as they are in `y`, which may have leading axes.
+
+        **Raises** `ValueError` for [`RotorInertia`][], [`Coupling`][] and bodies without mass."""
+        if y[0].ndim > 1:
+            times = jnp.broadcast_to(floating(t), y[0].shape[:1])
+            return jax.vmap(lambda t, y: self.joint_forces(t, y, args))(times, y)
+        known = self._motion.coordinates.known(y[0])
+        return find_joint_forces(self.assembly, t, self.poses(y), args, known)
 
     @property
     def _motion(self) -> TreeMotion:

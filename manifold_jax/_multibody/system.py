@@ -15,7 +15,7 @@ from .bodies import Pose
 from .checks import is_concrete
 from .frames import Frames
 from .joint_groups import jacobian, residuals
-from .known_coordinates import NONE_KNOWN
+from .known_coordinates import KnownCoordinates, NONE_KNOWN
 from .loads import add
 from .rotations import rates_matrix, turn_back
 from .rotors import names_of
@@ -28,9 +28,9 @@ class ConstantAssembly(eqx.Module):
         return self.assembly
 
 
-def check_for_poses(assembly: Any) -> None:
+def check_for_poses(assembly: Any, known: KnownCoordinates = NONE_KNOWN) -> None:
     """Raise for what is no part of a system in the poses of bodies: its mass matrix has a nonsingular block for
-    each, and angles that are read from them end at `pi`."""
+    each, and angles that are read from them, not known, end at `pi`."""
     mass = assembly.bodies.mass
     massless = np.flatnonzero(np.asarray(mass) == 0) if is_concrete(mass) else ()
     found = {
@@ -38,7 +38,10 @@ def check_for_poses(assembly: Any) -> None:
         "`Coupling`": assembly.couplings.names,
         "springs, servo motors or stops beyond half a turn of the hinges": tuple(
             dict.fromkeys(
-                name for loads in assembly.loads for name in loads.joints_with_whole_turns
+                name
+                for loads in assembly.loads
+                for name in loads.joints_with_whole_turns
+                if name not in known.names
             )
         ),
         "bodies without mass,": tuple(assembly.bodies.names[i] for i in massless),
@@ -97,13 +100,14 @@ class _Forces(eqx.Module):
     """The weight, the loads, and the gyroscopic forces on quaternions."""
 
     source: Callable
+    known: KnownCoordinates
 
     def __call__(self, t: RealScalarLike, q: Pose, v: Pose, args: Args) -> Pose:
         assembly, frames = self.source(args), Frames.of(q, v)
         weight = assembly.bodies.mass[:, None] * assembly.gravity[None, :]
         total = jnp.pad(weight, ((0, 1), (0, 0))), jnp.zeros_like(frames.origin)
         for loads in assembly.loads:
-            total = add(total, loads.wrench(t, (q, v), frames, NONE_KNOWN, args))
+            total = add(total, loads.wrench(t, (q, v), frames, self.known, args))
         force, torque = total[0][:-1], total[1][:-1]
         if q.planar:
             return Pose(force[:, :2], torque[:, 2])
@@ -113,8 +117,19 @@ class _Forces(eqx.Module):
 
 
 def system_of(
-    source: Callable, redundant: bool, rows: tuple[int, ...] | None = None
+    source: Callable,
+    redundant: bool,
+    rows: tuple[int, ...] | None = None,
+    known: KnownCoordinates = NONE_KNOWN,
 ) -> MechanicalSystem:
     equations = JointEquations(source, rows)
     mass = _Mass(source, _InverseInertia(source))
-    return MechanicalSystem(mass, equations, _Forces(source), redundant=redundant)
+    return MechanicalSystem(mass, equations, _Forces(source, known), redundant=redundant)
+
+
+def system_in_poses(assembly: Any, known: KnownCoordinates = NONE_KNOWN) -> MechanicalSystem:
+    """Return the system of an assembly in a state in which some coordinates of joints are `known`."""
+    check_for_poses(assembly, known)
+    rows = None if assembly.independent is None else assembly.independent.rows
+    redundant = assembly.redundant and rows is None
+    return system_of(ConstantAssembly(assembly), redundant, rows, known)

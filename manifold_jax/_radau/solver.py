@@ -145,7 +145,7 @@ class RadauIIA5(AbstractMassMatrixSolver, dfx.AbstractImplicitSolver):
         step = without_derivative(self._solve(fixed, state, derivative))
         newton_step = StageEquations(system, x0).newton_step
         Z = root_of_step(convert_closure(newton_step, step.Z), step.Z)
-        error = system.controlled(step.error)
+        error = system.counted_error(step.error)
         attempted = AttemptedStep(x0 + Z[2], error, step.defined, step.solved)
         y1, error, result = attempted.outcome(t0, t1, state, unravel)
         k1, k2 = constant(DENSE, Z) @ Z
@@ -162,7 +162,7 @@ class RadauIIA5(AbstractMassMatrixSolver, dfx.AbstractImplicitSolver):
         unravel = jfu.ravel_pytree(equations.system.y0)[1]
         size = lambda dx, z: size_in_tolerances(
             self.root_finder,
-            unravel(equations.system.controlled(dx)),
+            unravel(dx),
             unravel(x0),
             unravel(x0 + z),
         )
@@ -177,6 +177,7 @@ class RadauIIA5(AbstractMassMatrixSolver, dfx.AbstractImplicitSolver):
         )
         combination = constant(ERROR, Z) @ Z
         error = newton.filtered(newton.f0, combination)
+        counted = equations.system.counted_error
 
         def again() -> Vector:
             """Filter the estimate once more, where it is too large because of stiff components."""
@@ -184,7 +185,7 @@ class RadauIIA5(AbstractMassMatrixSolver, dfx.AbstractImplicitSolver):
             f = equations.rest(t0, x0 + error, V0) + product(newton.M, V0)
             return newton.filtered(f, combination)
 
-        error = jax.lax.cond(size(error, Z[2]) < 1, lambda: error, again)
+        error = jax.lax.cond(size(counted(error), Z[2]) < 1, lambda: error, again)
         solved &= newton.nonsingular
         Z = jnp.where(solved, Z, 0)
         return _StagesOfStep(Z, error, newton.defined, solved)

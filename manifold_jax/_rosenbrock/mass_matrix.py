@@ -45,9 +45,9 @@ class MassMatrixTerm(dfx.AbstractTerm):
         the `n` numbers of `y` in the order of `jax.flatten_util.ravel_pytree`. Of constant rank, or of one that
         changes at times which the controller knows (`jump_ts` of `diffrax.ClipStepSizeController`). Where
         a mass passes through zero solutions are in general not unique beyond, and nothing says so.
-    - `controlled`: which of the `n` numbers of `y` count in the error of a step and in that of the stages of
-        [`RadauIIA5`][], booleans of shape `(n,)`; all by default. Leave out auxiliary unknowns, such as
-        derivatives of others: these may be large between zeros at which no relative tolerance can be met.
+    - `controlled`: which of the `n` numbers of `y` count in the error of a step, booleans of shape `(n,)`;
+        all by default. Leave out auxiliary unknowns in which the equations are linear, such as derivatives
+        of others: these may be large between zeros at which no relative tolerance can be met.
 
     The initial value has to satisfy the algebraic equations. [`mj.diffeqsolve`][] sees to that
     (`consistent="project"` changes only what `M` does not see, `"check"` refuses); with
@@ -142,7 +142,7 @@ class MassMatrixTerm(dfx.AbstractTerm):
         known = _unpacked(self.packed_massless)
         return np.broadcast_to(known, (n,)) if known.size in (1, n) else None
 
-    def controlled(self, error: Float[Array, " n"]) -> Float[Array, " n"]:
+    def counted_error(self, error: Float[Array, " n"]) -> Float[Array, " n"]:
         """Return the error of a step, zero where it does not count."""
         if self.packed_controlled is None:
             return error

@@ -103,7 +103,7 @@ class AbstractRosenbrock(AbstractMassMatrixSolver):
         step = rosenbrock_step(
             self.tableau, system, x0, derivative, self.structure, self.largest_written_out
         )
-        error = system.controlled(step.error)
+        error = system.counted_error(step.error)
         attempted = AttemptedStep(step.x1, error, step.defined, step.nonsingular)
         y1, error, result = attempted.outcome(t0, t1, solver_state, unravel)
         dense_info = dict(y0=y0, y1=y1, k=tuple(unravel(k) for k in step.dense))

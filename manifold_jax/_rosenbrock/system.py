@@ -61,9 +61,9 @@ class System(NamedTuple):
         true_time = t * time_direction(self.terms)
         return mass_values(self.mass.mass, true_time, self._unravel(x), self.args)
 
-    def controlled(self, error: Vector) -> Vector:
+    def counted_error(self, error: Vector) -> Vector:
         """Return the error of a step, zero where it does not count."""
-        return error if self.mass is None else self.mass.controlled(error)
+        return error if self.mass is None else self.mass.counted_error(error)
 
     def sparsity(self, choice: Choice, x0: Vector, displacement: Vector | None) -> Sparsity | None:
         """Return how the linear systems of the step are solved."""

@@ -92,8 +92,8 @@ def diffeqsolve(
     - `resets`: jumps of the state at events ([`Reset`][]) or at known times ([`ResetAt`][]), a tuple. The
         solution then has `sol.resets` ([`Resets`][]). Dense output and saved values are those
         between the jumps; at a time of a jump the one after it is saved. Events from `t1` on are not met.
-    - `max_resets`: the largest number of jumps at events, for which room is made; known times have room
-        besides. One more ends the solve with `RESULTS.max_steps_reached`.
+    - `max_resets`: room is made for so many jumps, and for one more at each known time of [`ResetAt`][].
+        Another jump beyond all of these ends the solve with `RESULTS.max_steps_reached`.
 
     Python floats in `y0` and `args`, and all numbers in `t0`, `t1` and `dt0`, become arrays: other values do
     not cause another compilation. Integers in `args`, which may be shapes, and tolerances are part of the

@@ -62,7 +62,7 @@ def with_resets(
     conditions = Conditions.of(resets, t0, y0, args)
     if setup.throw and any(conditions.is_boolean):
         y0 = eqx.error_if(y0, jnp.any(conditions.true_at_start(t0, y0)), _TRUE_AT_START)
-    # Known times have room of their own, as their number is known.
+    # Room for known times besides, as their number is known.
     room = max_resets + conditions.num_known_times
     direction = ready.data.direction
     inner = _with_tolerances(run.solver, run.controller)

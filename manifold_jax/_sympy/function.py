@@ -23,7 +23,7 @@ _SPECIAL = {
     "erf": jsp.erf,
     "erfc": jsp.erfc,
     "erfinv": jsp.erfinv,
-    "factorial": jsp.factorial,
+    "factorial": lambda x: jsp.gamma(x + 1),  # that of JAX is zero for negative numbers
     "gamma": jsp.gamma,
     "loggamma": jsp.gammaln,
     "polygamma": jsp.polygamma,
