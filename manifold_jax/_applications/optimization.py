@@ -121,7 +121,8 @@ def gradient_flow(
         decide which basin is reached from a start near its edge, not the accuracy of the result.
     - `tolerance`: the flow ends where `max_j |P grad f| <= tolerance max_j |grad f|`, with
         `grad f` there or at `x0`, whichever is larger; by default 1e-8 (1e-5 in single
-        precision). Newton's method may then move the point by at most `sqrt(tolerance) (|x| + 1)`, otherwise it is left where it is.
+        precision). Newton's method may then move the point by at most `sqrt(tolerance) (|x| + 1)`,
+        otherwise it is left where it is.
     - `max_steps`: the most steps of the flow.
     - `throw`: raise if no stationary point is found. Otherwise look at `result`.
 

@@ -13,7 +13,7 @@ _DOUBLINGS = 32
 _ROUNDING, _ROUNDING_OF_SLOW = 1e-4, 1e-2
 
 
-class _Step(NamedTuple):
+class _ControlledStep(NamedTuple):
     """States and costates over a length of time, `x1 = (1 + change) x0 - effort costate1` and
     `costate0 = cost x0 + (1 + change)^T costate1`. `effort` and `cost` are symmetric and not negative."""
 
@@ -43,7 +43,7 @@ def solve_riccati(
     mean = lambda values: (values[1:] + values[:-1]) / 2
     step = _over_intervals(jnp.diff(ts), mean(A), mean(push), mean(Q))
 
-    def back(S: Array, step: _Step) -> tuple[Array, Array]:
+    def back(S: Array, step: _ControlledStep) -> tuple[Array, Array]:
         transition = _plus_one(step.change)
         controlled = jnp.linalg.solve(_plus_one(step.effort @ S), transition)
         S = _symmetric(step.cost + transition.T @ S @ controlled)
@@ -59,20 +59,22 @@ def _over_intervals(
     A: Float[Array, "intervals d d"],
     push: Float[Array, "intervals d d"],
     Q: Float[Array, "intervals d d"],
-) -> _Step:
+) -> _ControlledStep:
     """Double a short step of each interval until it is the interval."""
     H, units = jax.vmap(_hamiltonian)(lengths, A, push, Q)
     size = jax.lax.stop_gradient(jnp.max(jnp.sum(jnp.abs(H), axis=1), axis=1, initial=0))
     number = jnp.clip(jnp.ceil(jnp.log2(size)), 0, _DOUBLINGS)
     step = jax.vmap(_short_step)(H / 2 ** number[:, None, None], units)
 
-    def twice(carry: tuple[_Step, Array], k: Array) -> tuple[_Step, Array]:
+    def twice(carry: tuple[_ControlledStep, Array], k: Array) -> tuple[_ControlledStep, Array]:
         step = jax.vmap(_twice)(carry[0])
         new = step, jnp.maximum(carry[1], jax.vmap(_growth)(step))
         choose = jax.vmap(lambda more, new, old: jnp.where(more, new, old))
         return jax.tree.map(lambda new, old: choose(k < number, new, old), new, carry)
 
-    def body(carry: tuple[_Step, Array], k: Array) -> tuple[tuple[_Step, Array], None]:
+    def body(
+        carry: tuple[_ControlledStep, Array], k: Array
+    ) -> tuple[tuple[_ControlledStep, Array], None]:
         goes_on = k < jnp.max(number, initial=0)
         return jax.lax.cond(goes_on, twice, lambda carry, k: carry, carry, k), None
 
@@ -96,16 +98,18 @@ def _hamiltonian(
     return length * jnp.block([[A, -unit * push], [-Q / unit, -A.T]]), unit
 
 
-def _short_step(H: Float[Array, "two_d two_d"], unit: Float[Array, ""]) -> _Step:
+def _short_step(H: Float[Array, "two_d two_d"], unit: Float[Array, ""]) -> _ControlledStep:
     """Return the step for a matrix that is not large (NaN if it is)."""
     d = H.shape[0] // 2
     flow = jax.scipy.linalg.expm(H, max_squarings=0)
     back = jnp.linalg.inv(flow[d:, d:])
     effort, cost = -flow[:d, d:] @ back / unit, -back @ flow[d:, :d] * unit
-    return _Step(back.T - jnp.eye(d, dtype=back.dtype), _symmetric(effort), _symmetric(cost))
+    return _ControlledStep(
+        back.T - jnp.eye(d, dtype=back.dtype), _symmetric(effort), _symmetric(cost)
+    )
 
 
-def _twice(step: _Step) -> _Step:
+def _twice(step: _ControlledStep) -> _ControlledStep:
     """Return the step of twice the length. Of the transition only what differs from the identity is kept, which is
     rounded less while steps are short."""
     change, effort, cost = step
@@ -113,14 +117,14 @@ def _twice(step: _Step) -> _Step:
     both = jnp.concatenate([mixed, effort], axis=1)
     held, felt = jnp.split(jnp.linalg.solve(_plus_one(mixed), both), 2, axis=1)
     controlled = change - held @ transition
-    return _Step(
+    return _ControlledStep(
         change + transition @ controlled,
         _symmetric(effort + transition @ felt @ transition.T),
         _symmetric(cost + transition.T @ cost @ _plus_one(controlled)),
     )
 
 
-def _growth(step: _Step) -> Float[Array, ""]:
+def _growth(step: _ControlledStep) -> Float[Array, ""]:
     """Return by how much squares grow, whatever the units of the coordinates."""
     transition = _plus_one(step.change)
     return _largest(transition * transition.T)

@@ -21,6 +21,7 @@ from .._constraint.checks import check_field_is_real, check_state
 from .._constraint.diagnosis import Diagnosis
 from .._constraint.projection_info import ProjectionInfo
 from .algebraic import consistent, faults_of_start, MassMatrixEquations
+from .packed import packed, unpacked
 
 
 class MassMatrixTerm(dfx.AbstractTerm):
@@ -139,14 +140,14 @@ class MassMatrixTerm(dfx.AbstractTerm):
         """Return which of the `n` numbers on the diagonal are zero, `None` if that is not known."""
         if self.packed_massless is None:
             return None
-        known = _unpacked(self.packed_massless)
+        known = unpacked(self.packed_massless)
         return np.broadcast_to(known, (n,)) if known.size in (1, n) else None
 
     def counted_error(self, error: Float[Array, " n"]) -> Float[Array, " n"]:
         """Return the error of a step, zero where it does not count."""
         if self.packed_controlled is None:
             return error
-        counts = _unpacked(self.packed_controlled)
+        counts = unpacked(self.packed_controlled)
         if counts.shape != error.shape:
             raise ValueError(
                 f"`controlled` must have shape ({error.size},), a boolean for each number of y, got {counts.shape}."
@@ -161,7 +162,7 @@ def _packed_massless(mass: Any) -> bytes | None:
     is_matrix = len(leaves) == 1 and leaves[0] is mass and np.ndim(mass) == 2
     if callable(mass) or is_matrix or any(isinstance(x, jax.core.Tracer) for x in leaves):
         return None
-    return _packed(np.concatenate([np.ravel(np.asarray(leaf)) == 0 for leaf in leaves]))
+    return packed(np.concatenate([np.ravel(np.asarray(leaf)) == 0 for leaf in leaves]))
 
 
 def _packed_controlled(controlled: Any) -> bytes:
@@ -175,17 +176,7 @@ def _packed_controlled(controlled: Any) -> bytes:
             "`controlled` must be a vector of booleans, some of them true, one for each number of y, got "
             f"{counts.dtype} of shape {counts.shape}."
         )
-    return _packed(counts)
-
-
-def _packed(bits: np.ndarray) -> bytes:
-    return bytes([-bits.size % 8]) + np.packbits(bits).tobytes()
-
-
-def _unpacked(known: bytes) -> np.ndarray:
-    surplus, packed = known[0], known[1:]
-    bits = np.unpackbits(np.frombuffer(packed, np.uint8), count=8 * len(packed) - surplus)
-    return bits.astype(bool)
+    return packed(counts)
 
 
 @clear_errors
