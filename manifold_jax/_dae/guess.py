@@ -16,15 +16,14 @@ from .reduced import Reduced
 
 
 class Guess(NamedTuple):
-    """A guess of a state, part of which may be fixed."""
+    """A guess of a state, part of which may be fixed. `zero` says for each number of `z` and of `w` whether
+    no guess is given."""
 
     z: Float[Array, " states"]
     w: Float[Array, " n"]  # the leading derivatives
     fixed: tuple[bool, ...]  # for each number of `z`
     names: tuple[str, ...]  # of the unknowns that are fixed, as given
-    zero: tuple[
-        np.ndarray, np.ndarray
-    ]  # whether no guess is given, for each number of `z` and of `w`
+    zero: tuple[np.ndarray, np.ndarray]
 
     @staticmethod
     def of(system: Reduced, x: Y, derivatives: Any, fixed: Any) -> "Guess":

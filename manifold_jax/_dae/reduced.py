@@ -94,7 +94,7 @@ class Reduced(eqx.Module):
         if w is None:
             w = equations.solve()
         else:
-            # Those in which equations are linear do not count in the errors of steps: here these hold.
+            # Steps leave an error in derivatives that do not count in theirs; a Newton step removes it.
             fixed, w = without_derivative((equations, w))
             w = w - fixed.linearize(w).solve(fixed.residual(w))
 
