@@ -781,6 +781,56 @@ def test_failures_have_a_code_and_a_message():
         swing(P, SOLVERS["projected"], resets=(nowhere,))
 
 
+@pytest.mark.parametrize("event", [None, dfx.Event(lambda t, y, args, **kwargs: y[0] - 0.1)])
+def test_a_known_time_that_is_nan(event):
+    """The solve fails before its first step, alone in a batch; infinity is a jump that is not made."""
+    jump = lambda t, y, args: y + 1.0
+
+    def solve(times, throw=False):  # an array that is traced, or a function
+        reset = mj.ResetAt(times if event is None else lambda args: args, jump)
+        return solve_decay((reset,), args=times, event=event, throw=throw, stepsize_controller=PID)
+
+    def end(times):
+        sol = solve(times)
+        return sol.ys[-1, 0], sol
+
+    times = jnp.array([[0.5, jnp.inf], [jnp.nan, 0.5], [0.5, 0.75]])
+    slopes, sols = jax.jit(jax.vmap(jax.grad(end, has_aux=True)))(times)
+    failed = sols.result == dfx.RESULTS.nonfinite_input
+    assert failed.tolist() == [False, True, False]
+    assert (failed == ~jax.vmap(dfx.is_okay)(sols.result)).all()
+    assert sols.resets.number.tolist() == [1, 0, 2]
+    assert sols.stats["num_steps"][1] == 0
+    left = jnp.where(jnp.isinf(times), 0.0, jnp.exp(times - 1.0))
+    np.testing.assert_allclose(slopes[::2], left[::2], rtol=1e-7)
+    np.testing.assert_allclose(sols.ys[::2, -1, 0], jnp.exp(-1.0) + left[::2].sum(1), rtol=1e-7)
+    with pytest.raises(Exception, match="`times` of an `mj.ResetAt` .* write infinity"):
+        eqx.filter_jit(solve)(times[1], throw=True)
+
+
+def test_the_derivative_by_known_times_that_coincide():
+    """Exists for both together, with jumps of one reset or of two, and is not counted as missing."""
+    one = lambda t, y, args: y**2 + 0.3 * t
+    two = lambda t, y, args: 2.0 * y + 1.0
+    within = (mj.ResetAt(lambda a: jnp.stack([a, a]), one),)
+    across = tuple(mj.ResetAt(lambda a: a[None], jump) for jump in (one, two))
+    for resets, after in ((within, one), (across, two)):
+
+        def end(a, resets=resets):
+            sol = solve_decay(resets, args=a, stepsize_controller=PID)
+            return sol.ys[-1, 0], sol
+
+        def exact(a, after=after):
+            return after(a, one(a, jnp.exp(-a), None), None) * jnp.exp(a - 1.0)
+
+        a = jnp.array(0.4)
+        (value, sol), slope = jax.jit(jax.value_and_grad(end, has_aux=True))(a)
+        assert sol.resets.number == 2
+        assert sol.stats["num_nondifferentiable_resets"] == 0
+        np.testing.assert_allclose(value, exact(a), rtol=1e-7)
+        np.testing.assert_allclose(slope, jax.grad(exact)(a), rtol=1e-7)
+
+
 def test_an_event_that_a_jump_causes():
     """Its time, which is that of the jump, and the states have the derivatives of the closed form."""
     first = mj.Reset(

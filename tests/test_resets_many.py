@@ -100,6 +100,24 @@ def test_an_ensemble_on_disk(tmp_path):
     assert mj.open_ensemble(folder).resets["after"].shape == (SIZE, 5 + 2, 2)  # and for the kicks
 
 
+def test_a_known_time_that_is_nan():
+    """Its trajectory fails and says why, the others are as without it."""
+    times = ARGS["kicks"].at[2, 1].set(jnp.inf)
+    ensembles = [
+        many(STARTS, {**ARGS, "kicks": kicks}, resets=(KICK,))
+        for kicks in (times, times.at[4, 0].set(jnp.nan))
+    ]
+    without, ensemble = ensembles
+    assert not without.failed.any()
+    assert np.flatnonzero(ensemble.failed).tolist() == [4]
+    ((index, message),) = ensemble.failures()
+    assert index == 4
+    assert "`times` of an `mj.ResetAt` in `resets` has NaN" in message
+    others = np.arange(SIZE) != 4
+    np.testing.assert_array_equal(ensemble.ys[others], without.ys[others])
+    np.testing.assert_array_equal(ensemble.resets.times[others], without.resets.times[others])
+
+
 def test_an_event_ends_each_trajectory():
     """Where it happens, or not at all."""
     ended = many(

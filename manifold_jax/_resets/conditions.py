@@ -49,6 +49,13 @@ class Conditions(eqx.Module):
         return sum(r.times.size for r in self.resets if isinstance(r, ResetAt))  # pyright: ignore
 
     @property
+    def is_time_nan(self) -> BoolScalar:
+        """Whether one of the known times is NaN, which is after all others: it would never be met."""
+        known = [r.times for r in self.resets if isinstance(r, ResetAt)]
+        found = [jnp.any(jnp.isnan(times)) for times in known]  # pyright: ignore
+        return jnp.any(jnp.asarray([jnp.asarray(False), *found]))
+
+    @property
     def directions(self) -> list[int]:
         """Return 1 for events where a condition increases, -1 where it decreases, 0 for both."""
         signs = {True: 1, False: -1, None: 0}

@@ -13,6 +13,10 @@ from .._base.types import Args, RealScalarLike, Y
 from .._base.user_functions import check_function
 
 
+_NAN = "NaN, which is no time. Leave it out, or write infinity for a jump that is not made."
+TIME_IS_NAN = f"`times` of an `mj.ResetAt` in `resets` has {_NAN}"
+
+
 class Reset(eqx.Module):
     """A jump of the state where a condition changes sign: impacts, switches, thresholds.
 
@@ -73,12 +77,14 @@ class ResetAt(eqx.Module):
 
     At each of the times, which steps meet exactly, the state `y-` becomes `jump(t, y-, args)`,
     corrected onto the manifold of the solver. Times before `t0` or from `t1` on are ignored; at `t0`
-    the jump is made first. The state has a derivative with respect to `times`.
+    the jump is made first. The state has a derivative with respect to `times`; where two of them coincide,
+    also of two of the `resets`, only for changes that keep them together.
 
     **Arguments:**
 
     - `times`: array of shape `(k,)`, in any order; or a function `times(args)` that returns it, for times
-        that each trajectory of an ensemble has of its own.
+        that each trajectory of an ensemble has of its own. Infinity stands for a jump that is not made; a
+        solve with NaN ends before its first step, with `RESULTS.nonfinite_input`.
     - `jump`: `jump(t, y, args) -> y`, the state after the jump, of the same structure, shapes and dtypes.
 
     **Raises:**
@@ -113,9 +119,7 @@ def _vector(times: Any) -> Array:
             f"`times` must be a vector of numbers, or a function of `args` that returns one, got {_described(times)}."
         )
     if not isinstance(array, jax.core.Tracer) and np.isnan(np.asarray(array)).any():
-        raise ValueError(
-            "`times` has NaN, which is no time. Leave it out, or write infinity for a jump that is not made."
-        )
+        raise ValueError(f"`times` has {_NAN}")
     return array if jnp.issubdtype(array.dtype, jnp.floating) else array.astype(float)
 
 

@@ -110,7 +110,7 @@ def diffeqsolve(
         their sum over that of the displacements. For a tangent field it is as small as the tolerance;
         otherwise see [`tangent_field`][].
     - `num_nondifferentiable_resets`, with `resets`: how many of them have no derivative, because a
-        condition only touches zero, or because there are several at one time.
+        condition only touches zero, or because several conditions cross zero at one time.
 
     **Raises:**
 
@@ -175,7 +175,8 @@ def diffeqsolve(
     )
     # The dense solution, which is returned, holds the original constraint.
     if resets:
-        return finish_resets(setup, ready, sol, constraint, saveat.controller_state)
+        keeps_state = saveat.controller_state
+        return finish_resets(setup, ready, sol, run.is_time_nan, constraint, keeps_state)
     return Solution.of(finish(setup, ready, sol, constraint))
 
 

@@ -7,12 +7,13 @@ import diffrax as dfx
 import equinox as eqx
 import jax.numpy as jnp
 import jax.tree_util as jtu
+from diffrax import RESULTS
 
 from .._base.compat import use_stepsize_tol
-from .._base.types import Y
+from .._base.types import BoolScalar, Y
 from .._resets.conditions import Conditions
 from .._resets.controller import ResettingController, ResettingState
-from .._resets.reset import Reset, ResetAt
+from .._resets.reset import Reset, ResetAt, TIME_IS_NAN
 from .._resets.solver import ResetState, Resetting
 from .._resets.terminating import TerminatingEvents
 from .finish import finish
@@ -37,13 +38,14 @@ NO_STATE_AFTER = (
 
 
 class LoopArguments(NamedTuple):
-    """What Diffrax is given for a solve."""
+    """What Diffrax is given for a solve, and whether a known time of `resets` is NaN."""
 
     solver: dfx.AbstractSolver
     controller: dfx.AbstractStepSizeController
     saveat: dfx.SaveAt
     solver_state: Any
     y0: Y
+    is_time_nan: BoolScalar | bool = False
 
 
 def with_resets(
@@ -62,6 +64,8 @@ def with_resets(
     conditions = Conditions.of(resets, t0, y0, args)
     if setup.throw and any(conditions.is_boolean):
         y0 = eqx.error_if(y0, jnp.any(conditions.true_at_start(t0, y0)), _TRUE_AT_START)
+    is_time_nan = conditions.is_time_nan  # such a solve ends before its first step, as one from NaN
+    y0 = jtu.tree_map(lambda leaf: jnp.where(is_time_nan, jnp.nan, leaf), y0)
     # Room for known times besides, as their number is known.
     room = max_resets + conditions.num_known_times
     direction = ready.data.direction
@@ -72,7 +76,7 @@ def with_resets(
     state = None if run.solver_state is None else solver.starting(run.solver_state)
     controller = ResettingController(run.controller, room)
     saveat = eqx.tree_at(lambda s: (s.solver_state, s.controller_state), run.saveat, (True, True))
-    return LoopArguments(solver, controller, saveat, state, y0)
+    return LoopArguments(solver, controller, saveat, state, y0, is_time_nan)
 
 
 def _with_tolerances(solver: Any, controller: Any) -> Any:
@@ -89,7 +93,12 @@ def _with_tolerances(solver: Any, controller: Any) -> Any:
 
 
 def finish_resets(
-    setup: Setup, ready: Ready, sol: dfx.Solution, constraint: Any, keeps_controller_state: bool
+    setup: Setup,
+    ready: Ready,
+    sol: dfx.Solution,
+    is_time_nan: BoolScalar | bool,
+    constraint: Any,
+    keeps_controller_state: bool,
 ) -> Solution:
     """Report a solve with resets."""
     state, controller_state = sol.solver_state, sol.controller_state
@@ -100,9 +109,11 @@ def finish_resets(
     kept = controller_state.inner if keeps_controller_state else None
     sol = eqx.tree_at(where, sol, (state.inner, kept), is_leaf=lambda x: x is None)
     stats = {**sol.stats, "num_nondifferentiable_resets": state.history.irregular}
-    sol = eqx.tree_at(lambda s: s.stats, sol, stats)
+    result = RESULTS.where(is_time_nan, RESULTS.nonfinite_input, sol.result)  # pyright: ignore[reportArgumentType]
+    sol = eqx.tree_at(lambda s: (s.stats, s.result), sol, (stats, result))
     too_many = controller_state.record.number > resets.times.size
     faults = [(too_many, TOO_MANY_RESETS), (state.history.failed, NO_STATE_AFTER)]
+    faults.append((is_time_nan, TIME_IS_NAN))
     sol = finish(setup, ready, sol, constraint, faults)
     if not setup.saveat.solver_state:
         sol = eqx.tree_at(lambda s: s.solver_state, sol, None, is_leaf=lambda x: x is None)

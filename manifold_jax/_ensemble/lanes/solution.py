@@ -12,6 +12,7 @@ from jaxtyping import Array, PyTree
 
 from ..._base.compat import is_okay, nonlinear_failure, number_of_result
 from ..._resets.record import Resets
+from ..._resets.reset import TIME_IS_NAN
 from ..._solve.outcome import (
     is_unusable_start,
     is_without_time,
@@ -76,9 +77,10 @@ class EnsembleSolution(eqx.Module):
 
 def messages_of(solver: dfx.AbstractSolver, has_resets: bool) -> tuple[str, ...]:
     """Return the messages for the numbers of `EnsembleSolution.reasons`."""
-    messages = messages_for(solver)
+    messages, no_time = messages_for(solver), NO_TIME
     if has_resets:
+        no_time += f" Or: {TIME_IS_NAN}"
         more = (RESULTS.max_steps_reached, TOO_MANY_RESETS), (nonlinear_failure(), NO_STATE_AFTER)
         for result, text in more:
             messages[int(number_of_result(result))] += f" Or: {text}"
-    return (*messages, NO_TIME, NOT_FINITE_START, UNUSABLE_START)
+    return (*messages, no_time, NOT_FINITE_START, UNUSABLE_START)
