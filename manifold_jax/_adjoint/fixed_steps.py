@@ -1,5 +1,5 @@
 """Forward mode at the steps that were made, as in reverse mode: their ends are those of the record and
-are held fixed, except for the end of the solve."""
+are held fixed, except for the end of the solve and the times that the controller prescribes."""
 
 from typing import Any, NamedTuple
 
@@ -15,6 +15,7 @@ from .._base.compat import LoopState, Progress, with_controller_state, with_next
 from .._base.types import IntScalar
 from .._linalg.newton import without_derivative
 from .._resets.controller import has_prescribed_times, ResettingController
+from .prescribed import prescribed_times, with_prescribed
 from .record import Record
 
 
@@ -31,10 +32,13 @@ class SizesHeldFixed(dfx.AbstractStepSizeController):
 
     def adapt_step_size(self, t0, t1, y0, y1_candidate, args, y_error, error_order, state) -> Any:
         fixed = without_derivative((t0, t1, y0, y1_candidate, args, y_error, error_order, state))
-        keep, next_t0, next_t1, jump, state, result = self.controller.adapt_step_size(*fixed)
-        # A step begins at the end of the one before, which may be the end of the solve.
-        ends = jnp.where(next_t0 == fixed[1], t1, jnp.where(next_t0 == fixed[0], t0, next_t0))
-        return keep, ends, next_t1, jump, state, result
+        controller = without_derivative(self.controller)
+        keep, next_t0, next_t1, jump, state, result = controller.adapt_step_size(*fixed)
+        # A step begins at the end of the one before, which may be the end of the solve, or after a jump.
+        moved = lambda t: with_prescribed(prescribed_times(self.controller, t.dtype), t)
+        begun = moved(next_t0)
+        start = jnp.where(next_t0 == fixed[1], t1, jnp.where(next_t0 == fixed[0], t0, begun))
+        return keep, start, moved(next_t1), jump, state, result
 
 
 class MadeSteps(eqx.Module):
@@ -149,8 +153,10 @@ class StepsOfRecord(dfx.AbstractStepSizeController):
         own, ends = without_derivative((own, (t0, t1)))
         # Not zero derivatives but none: a Brownian motion refuses any with respect to its times.
         choice = without_derivative(_choice(own, ends, state.steps, self.made))
-        start = jnp.where(choice.start == t1, t1, jnp.where(choice.start == t0, t0, choice.start))
-        end = jnp.where(choice.end == self.end, self.end, choice.end)
+        times = prescribed_times(self.controller.controller, choice.end.dtype)
+        begun = with_prescribed(times, choice.start)
+        start = jnp.where(choice.start == t1, t1, jnp.where(choice.start == t0, t0, begun))
+        end = jnp.where(choice.end == self.end, self.end, with_prescribed(times, choice.end))
         if after_jump is not False:
             after_jump = choice.after_jump
         RESULTS = dfx.RESULTS
@@ -189,11 +195,13 @@ def with_steps_held_fixed(
     return StepsOfRecord(fixed, made, end)
 
 
-def with_end_held_fixed(state: LoopState, t1: Any, made: MadeSteps | None) -> LoopState:
-    """Hold the end of the first step fixed, unless it is the end of the solve."""
+def with_end_held_fixed(
+    state: LoopState, t1: Any, made: MadeSteps | None, prescribed: Any
+) -> LoopState:
+    """Hold the end of the first step fixed, unless it is the end of the solve or one of the prescribed times."""
     tnext = lax.stop_gradient(Progress.of(state).tnext)
     first = tnext if made is None else without_derivative(_first_end(tnext, made))
-    return with_next_time(state, jnp.where(first == t1, t1, first))
+    return with_next_time(state, jnp.where(first == t1, t1, with_prescribed(prescribed, first)))
 
 
 def event_of_controller(

@@ -7,6 +7,7 @@ import jax.tree_util as jtu
 from jaxtyping import Array, Bool, Float, Int
 
 from .._base.types import FloatScalar, IntScalar, Y
+from .prescribed import which_prescribed
 from .record import Vectors
 from .replay import State
 
@@ -20,6 +21,7 @@ class Ends(NamedTuple):
     num_steps: IntScalar
     num_accepted: IntScalar
     y: Y
+    prescribed: Float[Array, " prescribed"] | None  # times of the step size controller
 
 
 class RecordedStep(NamedTuple):
@@ -45,23 +47,36 @@ class RecordedStep(NamedTuple):
 
 
 class TimesBar(NamedTuple):
-    """Cotangents of the ends of the solve and of the times of `SaveAt(ts=...)`; other steps are fixed."""
+    """Cotangents of the ends of the solve, of the times of `SaveAt(ts=...)` and of those that the step size
+    controller prescribes; other steps are fixed."""
 
     t0: FloatScalar
     t1: FloatScalar
     ts: list[Float[Array, " times"] | None]
+    prescribed: Float[Array, " prescribed"] | None
 
     def at_ends_of_step(
         self, ends: Ends, step: RecordedStep, start_bar: Any, end_bar: Any
     ) -> "TimesBar":
-        t0 = self.t0 + jnp.where(step.start == ends.t0, start_bar, 0)
-        return self._replace(t0=t0, t1=self.t1 + jnp.where(step.end == ends.t1, end_bar, 0))
+        at_t0, at_t1 = step.start == ends.t0, step.end == ends.t1
+        t0 = self.t0 + jnp.where(at_t0, start_bar, 0)
+        times = self._replace(t0=t0, t1=self.t1 + jnp.where(at_t1, end_bar, 0))
+        times = times._at_prescribed(ends, step.start, jnp.where(at_t0, 0, start_bar))
+        return times._at_prescribed(ends, step.end, jnp.where(at_t1, 0, end_bar))
 
-    def at_end_of_solve(self, ends: Ends, t: Any, bar: FloatScalar) -> "TimesBar":
-        """Add the cotangent of a value saved at `t` to that of an end of the solve, if `t` is one."""
-        at_start = t == ends.t0
-        t0 = self.t0 + jnp.where(at_start, bar, 0)
-        return self._replace(t0=t0, t1=self.t1 + jnp.where((t == ends.t1) & ~at_start, bar, 0))
+    def at_saved_state(self, ends: Ends, t: Any, bar: FloatScalar) -> "TimesBar":
+        """Add the cotangent of a value saved at `t`, where a step ends or the first one begins."""
+        at_t0 = t == ends.t0
+        at_t1 = (t == ends.t1) & ~at_t0
+        t0 = self.t0 + jnp.where(at_t0, bar, 0)
+        times = self._replace(t0=t0, t1=self.t1 + jnp.where(at_t1, bar, 0))
+        return times._at_prescribed(ends, t, jnp.where(at_t0 | at_t1, 0, bar))
+
+    def _at_prescribed(self, ends: Ends, t: Any, bar: FloatScalar) -> "TimesBar":
+        if self.prescribed is None or ends.prescribed is None:
+            return self
+        is_one, i = which_prescribed(ends.prescribed, t)
+        return self._replace(prescribed=self.prescribed.at[i].add(jnp.where(is_one, bar, 0)))
 
     def at_saved_time(self, k: int, i: IntScalar, bar: FloatScalar) -> "TimesBar":
         of_saving = self.ts[k]

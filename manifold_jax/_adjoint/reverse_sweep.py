@@ -73,7 +73,9 @@ class ReverseSweep(eqx.Module):
     def _no_times(self) -> TimesBar:
         zero = jnp.zeros_like(self.ends.t0)
         counts = (saving.num_times for saving in self.functions.rest.savings)
-        return TimesBar(zero, zero, [jnp.zeros(n, zero.dtype) if n else None for n in counts])
+        ts = [jnp.zeros(n, zero.dtype) if n else None for n in counts]
+        prescribed = jtu.tree_map(jnp.zeros_like, self.ends.prescribed)
+        return TimesBar(zero, zero, ts, prescribed)
 
     def _steps_of_segment(self, i: IntScalar) -> RecordedStep:
         """Return the steps of a segment, with leading axes for blocks and steps."""

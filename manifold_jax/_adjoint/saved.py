@@ -96,7 +96,7 @@ class SavedValues(eqx.Module):
         leaves_bar, y_bar, more = pullback(bar)
         start = gradient.start
         if times is not None:
-            times = times.at_end_of_solve(self.ends, t, t_bar + more)
+            times = times.at_saved_state(self.ends, t, t_bar + more)
         if start is not None:  # the time may be that of an event
             start += t_bar + more
         state = gradient.state._replace(y=add(gradient.state.y, y_bar))

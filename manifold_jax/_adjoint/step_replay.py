@@ -4,6 +4,7 @@ from typing import Any
 
 import diffrax as dfx
 import equinox as eqx
+import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 
@@ -32,6 +33,7 @@ from .fixed_steps import (
     with_steps_held_fixed,
 )
 from .gradient import Ends, TimesBar, with_zeros
+from .prescribed import prescribed_times
 from .record import Record, recording
 from .replay import outputs_of, Replay, Solve, State, subs_of, with_outputs
 from .reverse_sweep import DenseBars, ResetBars, ReverseSweep
@@ -60,7 +62,8 @@ class StepReplayAdjoint(dfx.AbstractAdjoint):
     `diffrax.ForwardMode()` takes less memory.)
 
     Derivatives are those with respect to `y0`, `args`, all that terms, constraints and `fn` hold or
-    close over, `t0`, `t1` and `SaveAt(ts=...)`. Under `vmap` all trajectories share one counter.
+    close over, `t0`, `t1`, `SaveAt(ts=...)` and the times that a controller
+    prescribes (`jump_ts`, `step_ts`, `StepTo(ts=...)`). Under `vmap` all trajectories share one counter.
 
     **Arguments:**
 
@@ -117,11 +120,13 @@ class StepReplayAdjoint(dfx.AbstractAdjoint):
                 "`adjoint=StepReplayAdjoint()` cannot repeat the steps of an `UnsafeBrownianPath`. Use a "
                 "`VirtualBrownianTree`, or `adjoint=diffrax.ForwardMode()`."
             )
-        times = t0, t1, [sub.ts for sub in subs_of(saveat)]
+        prescribed = prescribed_times(stepsize_controller, Progress.of(init_state).tprev.dtype)
+        times = t0, t1, [sub.ts for sub in subs_of(saveat)], prescribed
         dt0 = nondifferentiable(dt0, msg=_NO_STEP_SIZES)
 
         def run(outer_while_loop, made):
             controller = with_steps_held_fixed(stepsize_controller, made, t1)
+            first = with_end_held_fixed(init_state, t1, made, prescribed)
             final_state, statistics = diffrax_loop(
                 solver=_with_loops(solver, "lax"),
                 stepsize_controller=controller,
@@ -133,7 +138,7 @@ class StepReplayAdjoint(dfx.AbstractAdjoint):
                 max_steps=max_steps,
                 terms=terms,
                 args=args,
-                init_state=numbered(controller, with_end_held_fixed(init_state, t1, made)),
+                init_state=numbered(controller, first),
                 inner_while_loop=_while_loop,
                 outer_while_loop=outer_while_loop,
                 progress_meter=progress_meter,
@@ -247,10 +252,10 @@ def _gradient(differentiable, is_perturbed, values, cotangents_out):
     outputs_bar, _ = cotangents_out
     if record is None:
         raise RuntimeError(_UNBOUNDED)
-    replay, start, (t0, t1, ts), run = differentiable
+    replay, start, (t0, t1, ts, prescribed), run = differentiable
     end = Progress.of(final_state)
     bar = with_zeros(eqx.filter(outputs, eqx.is_inexact_array), outputs_bar)
-    ends = Ends(t0, t1, end.tprev, end.num_steps, end.num_accepted_steps, end.y)
+    ends = Ends(t0, t1, end.tprev, end.num_steps, end.num_accepted_steps, end.y, prescribed)
     functions = Functions(*eqx.partition(replay, is_perturbed[0]))
     dense = DenseBars(
         bar.dense_infos if jtu.tree_leaves(outputs_bar.dense_infos) else None,
@@ -265,10 +270,10 @@ def _gradient(differentiable, is_perturbed, values, cotangents_out):
     back = ReverseSweep(functions, record, start, ends, saved, dense, resets)
     last_bar = State(bar.y, bar.solver_state)
     gradient = back.run(last_bar, timed=any(jtu.tree_leaves(is_perturbed[2])))
-    times = gradient.times or TimesBar(None, None, [None] * len(ts))  # pyright: ignore[reportArgumentType]
+    times = gradient.times or TimesBar(None, None, [None] * len(ts), None)  # pyright: ignore[reportArgumentType]
     if gradient.times is not None and bar.dense_ts is not None:
-        at = lambda t: jnp.sum(jnp.where(outputs.dense_ts == t, bar.dense_ts, 0))
-        times = times._replace(t0=times.t0 + at(t0), t1=times.t1 + at(t1))
+        add = lambda times, row: (times.at_saved_state(ends, *row), None)
+        times = lax.scan(add, times, (outputs.dense_ts, bar.dense_ts))[0]
     return gradient.leaves, gradient.state, tuple(times), eqx.filter(run, lambda leaf: False)
 
 
