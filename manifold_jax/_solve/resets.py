@@ -113,7 +113,7 @@ def finish_resets(
     sol = eqx.tree_at(lambda s: (s.stats, s.result), sol, (stats, result))
     too_many = controller_state.record.number > resets.times.size
     faults = [(too_many, TOO_MANY_RESETS), (state.history.failed, NO_STATE_AFTER)]
-    faults.append((is_time_nan, TIME_IS_NAN))
+    faults.append((jnp.asarray(is_time_nan), TIME_IS_NAN))
     sol = finish(setup, ready, sol, constraint, faults)
     if not setup.saveat.solver_state:
         sol = eqx.tree_at(lambda s: s.solver_state, sol, None, is_leaf=lambda x: x is None)
