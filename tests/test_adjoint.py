@@ -524,24 +524,25 @@ def test_steps_across_jumps_of_the_field():
     np.testing.assert_allclose(reverse, -np.cos(1.0), rtol=1e-6)  # y(1) = -sin(theta)
 
 
-def test_times_that_the_controller_prescribes():
-    """A switch at a parameter: the ends of steps just before and just behind it move with it."""
+def turn_with_a_switch(switch, rates, controller, **options):
+    """A point that turns at one rate before the time `switch` and at another one after it."""
     circle = mj.Constraint(lambda t, y, args: y @ y - 1.0)
-    saveat = dfx.SaveAt(ts=jnp.array([0.2, 0.7, 1.0]), dense=True)
+    rate = lambda t, switch: jnp.where(t < switch, *rates)
+    field = lambda t, y, switch: rate(t, switch) * jnp.stack([-y[1], y[0]])
+    parts = dfx.ODETerm(field), mj.Projected(dfx.Tsit5(), circle), 0.0, 1.0, None
+    options |= dict(stepsize_controller=controller)
+    return mj.diffeqsolve(*parts, jnp.array([1.0, 0.0]), switch, **options)
 
-    def heights(switch, controller=None, rates=(0.7, -1.4), **options):
-        rate = lambda t, switch: jnp.where(t < switch, *rates)
-        field = lambda t, y, switch: rate(t, switch) * jnp.stack([-y[1], y[0]])
-        tight = dfx.PIDController(rtol=1e-9, atol=1e-9)
-        options |= dict(
-            stepsize_controller=controller
-            or dfx.ClipStepSizeController(tight, jump_ts=switch[None]),
-            saveat=saveat if controller is None else dfx.SaveAt(t1=True),
-        )
-        parts = dfx.ODETerm(field), mj.Projected(dfx.Tsit5(), circle), 0.0, 1.0, None
-        sol = mj.diffeqsolve(*parts, jnp.array([1.0, 0.0]), switch, **options)
-        if controller is not None:
-            return sol.ys[-1]
+
+def test_jumps_at_a_parameter():
+    """The ends of steps just before and just behind it move with it; one at infinity is never met."""
+
+    def heights(switch):
+        controller = dfx.PIDController(rtol=1e-9, atol=1e-9)
+        jump_ts = jnp.stack([jnp.array(jnp.inf), switch])
+        controller = dfx.ClipStepSizeController(controller, jump_ts=jump_ts)
+        saveat = dfx.SaveAt(ts=jnp.array([0.2, 0.7, 1.0]), dense=True)
+        sol = turn_with_a_switch(switch, (0.7, -1.4), controller, saveat=saveat)
         return jnp.append(sol.ys[:, 1], sol.evaluate(0.9)[1])
 
     # The angle is 0.7 t, and behind the switch 0.7 (3 switch - 2 t).
@@ -549,18 +550,27 @@ def test_times_that_the_controller_prescribes():
     slopes = np.where(t < 0.5, 0.0, 2.1 * np.cos(0.7 * (1.5 - 2 * t)))
     np.testing.assert_allclose(jax.jit(jax.jacfwd(heights))(switch), slopes, atol=1e-7)
     np.testing.assert_allclose(jax.jit(jax.jacrev(heights))(switch), slopes, atol=1e-7)
+    second = jax.jit(jax.jacfwd(jax.grad(lambda switch: heights(switch)[2])))(switch)
+    np.testing.assert_allclose(second, -(2.1**2) * np.sin(0.7 * -0.5), rtol=1e-6)
 
-    def coarse(times, adjoint):
+
+@pytest.mark.parametrize("dense", [False, True])
+def test_times_to_step_to(dense):
+    """Have derivatives of the size of the error of so few steps, as in plain forward mode."""
+
+    def turned(times, adjoint):
         controller = dfx.StepTo(ts=jnp.concatenate([jnp.zeros(1), times, jnp.ones(1)]))
-        rates = 2.0, 2.0
-        options = dict(controller=controller, rates=rates, adjoint=adjoint, max_steps=4)
-        return heights(switch, **options) @ jnp.array([1.0, 2.0])
+        saveat = dfx.SaveAt(t1=True, dense=dense)
+        options = dict(adjoint=adjoint, max_steps=4, saveat=saveat)
+        sol = turn_with_a_switch(0.5, (2.0, 2.0), controller, **options)
+        return (sol.evaluate(0.7) if dense else sol.ys[-1]) @ jnp.array([1.0, 2.0])
 
     times = jnp.array([0.3, 0.8])
-    of_steps = lambda adjoint: lambda times: coarse(times, adjoint)
-    slopes = jax.jit(jax.jacfwd(of_steps(dfx.ForwardMode())))(times)
-    assert np.abs(slopes).min() > 1e-6  # nothing but the error of so few steps
-    np.testing.assert_allclose(jax.grad(of_steps(mj.StepReplayAdjoint()))(times), slopes, rtol=1e-9)
+    slopes = jax.jit(jax.jacfwd(lambda times: turned(times, dfx.ForwardMode())))(times)
+    assert np.abs(slopes).min() > 1e-6
+    for derivative in (jax.jacrev, jax.jacfwd):
+        found = jax.jit(derivative(lambda times: turned(times, mj.StepReplayAdjoint())))(times)
+        np.testing.assert_allclose(found, slopes, rtol=1e-9)
 
 
 @pytest.mark.slow

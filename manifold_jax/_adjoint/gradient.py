@@ -2,6 +2,7 @@
 
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, Bool, Float, Int
@@ -21,7 +22,8 @@ class Ends(NamedTuple):
     num_steps: IntScalar
     num_accepted: IntScalar
     y: Y
-    prescribed: Float[Array, " prescribed"] | None  # times of the step size controller
+    # Times of the step size controller; None unless they have derivatives.
+    prescribed: Float[Array, " prescribed"] | None
 
 
 class RecordedStep(NamedTuple):
@@ -71,6 +73,16 @@ class TimesBar(NamedTuple):
         t0 = self.t0 + jnp.where(at_t0, bar, 0)
         times = self._replace(t0=t0, t1=self.t1 + jnp.where(at_t1, bar, 0))
         return times._at_prescribed(ends, t, jnp.where(at_t0 | at_t1, 0, bar))
+
+    def at_dense_times(self, ends: Ends, t: Any, bar: Any) -> "TimesBar":
+        """Add the cotangents of the ends of the steps of a dense solution, along a leading axis."""
+        at = lambda time: jnp.sum(jnp.where(t == time, bar, 0))
+        times = self._replace(t0=self.t0 + at(ends.t0), t1=self.t1 + at(ends.t1))
+        if self.prescribed is None or ends.prescribed is None:
+            return times
+        others = jnp.where((t == ends.t0) | (t == ends.t1), 0, bar)
+        is_one, i = jax.vmap(which_prescribed, in_axes=(None, 0))(ends.prescribed, t)
+        return times._replace(prescribed=self.prescribed.at[i].add(jnp.where(is_one, others, 0)))
 
     def _at_prescribed(self, ends: Ends, t: Any, bar: FloatScalar) -> "TimesBar":
         if self.prescribed is None or ends.prescribed is None:

@@ -4,7 +4,6 @@ from typing import Any
 
 import diffrax as dfx
 import equinox as eqx
-import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 
@@ -62,8 +61,9 @@ class StepReplayAdjoint(dfx.AbstractAdjoint):
     `diffrax.ForwardMode()` takes less memory.)
 
     Derivatives are those with respect to `y0`, `args`, all that terms, constraints and `fn` hold or
-    close over, `t0`, `t1`, `SaveAt(ts=...)` and the times that a controller
-    prescribes (`jump_ts`, `step_ts`, `StepTo(ts=...)`). Under `vmap` all trajectories share one counter.
+    close over, `t0`, `t1`, `SaveAt(ts=...)` and the times that a controller prescribes (`jump_ts`, `step_ts`,
+    `StepTo(ts=...)`). A field that jumps at a parameter needs that time in `jump_ts`: a step that ends at one of the
+    others also evaluates the field there, behind the jump. Under `vmap` all trajectories share one counter.
 
     **Arguments:**
 
@@ -255,6 +255,8 @@ def _gradient(differentiable, is_perturbed, values, cotangents_out):
     replay, start, (t0, t1, ts, prescribed), run = differentiable
     end = Progress.of(final_state)
     bar = with_zeros(eqx.filter(outputs, eqx.is_inexact_array), outputs_bar)
+    if not is_perturbed[2][3]:
+        prescribed = None
     ends = Ends(t0, t1, end.tprev, end.num_steps, end.num_accepted_steps, end.y, prescribed)
     functions = Functions(*eqx.partition(replay, is_perturbed[0]))
     dense = DenseBars(
@@ -272,8 +274,7 @@ def _gradient(differentiable, is_perturbed, values, cotangents_out):
     gradient = back.run(last_bar, timed=any(jtu.tree_leaves(is_perturbed[2])))
     times = gradient.times or TimesBar(None, None, [None] * len(ts), None)  # pyright: ignore[reportArgumentType]
     if gradient.times is not None and bar.dense_ts is not None:
-        add = lambda times, row: (times.at_saved_state(ends, *row), None)
-        times = lax.scan(add, times, (outputs.dense_ts, bar.dense_ts))[0]
+        times = times.at_dense_times(ends, outputs.dense_ts, bar.dense_ts)
     return gradient.leaves, gradient.state, tuple(times), eqx.filter(run, lambda leaf: False)
 
 
