@@ -75,3 +75,11 @@ def as_a_user_meets_it():
     jaxtyping.config.update("jaxtyping_disable", True)
     yield
     jaxtyping.config.update("jaxtyping_disable", False)
+
+
+@pytest.fixture(autouse=True)
+def _types_are_checked_in_the_default_run(request):
+    """The long tests go through the same functions as the short ones, where every argument is
+    checked; there the checks would only cost a fifth of the time."""
+    if request.node.get_closest_marker("slow"):
+        request.getfixturevalue("as_a_user_meets_it")
