@@ -446,6 +446,39 @@ def test_order_of_events_at_one_time():
     assert sol.resets.times[0] == sol.resets.times[1]
 
 
+@pytest.mark.parametrize("time", [0.5, 0.7, 0.3000000000000001])
+def test_a_known_time_at_which_a_condition_crosses(time):
+    """The first in `resets` comes first, here, too, and the event has no derivative."""
+    # The rounding of `y[0]` puts its crossing a little before or after the known time.
+    crossing = mj.Reset(
+        lambda t, y, args: y[0] - jnp.exp(time), lambda t, y, args: y.at[1].set(10 * y[1] + 1)
+    )
+    known = mj.ResetAt([time], lambda t, y, args: y.at[1].set(10 * y[1] + 2))
+    away = mj.ResetAt([time], lambda t, y, args: y.at[:].set(jnp.array([0.1, 7.0])))
+    field = dfx.ODETerm(lambda t, y, args: y * jnp.array([1.0, 0.0]))
+
+    def solve(*resets):
+        return mj.diffeqsolve(
+            field,
+            dfx.Dopri8(),
+            0.0,
+            1.0,
+            0.02,
+            jnp.array([1.0, 0.0]),
+            resets=resets,
+        )
+
+    for resets, digits in ((known, crossing), 21), ((crossing, known), 12):
+        sol = solve(*resets)
+        assert sol.ys[0, 1] == digits
+        assert sol.resets.number == 2
+        np.testing.assert_array_equal(sol.resets.times[:2], [time] * 2)
+        assert sol.stats["num_nondifferentiable_resets"] > 0
+    sol = solve(away, crossing)  # from where the condition does not cross again
+    assert sol.ys[0, 1] == 7
+    assert sol.resets.number == 1
+
+
 def test_an_event_at_the_start():
     """On the surface and moving across it: at once. On its other side: not at all."""
     falling = BALL.at[2].set(0.0).at[3].set(-1.0)

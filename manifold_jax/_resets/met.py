@@ -8,8 +8,9 @@ from jaxtyping import Array, Float
 
 from .._base.compat import nonlinear_failure
 from .._base.types import BoolScalar, FloatScalar, IntScalar, Y
+from .history import History
 from .jump import Jump
-from .search import Found, History
+from .search import Found
 
 
 class Met(NamedTuple):

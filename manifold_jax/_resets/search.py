@@ -3,42 +3,16 @@
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
 from .._base.types import BoolScalar, FloatScalar, IntScalar, Y
 from .at_start import EventAtStart
 from .bracket import root_in_bracket
+from .history import History
 from .samples import BEYOND, SampledConditions, SearchedStep
 from .sensitivity import Sensitivity
-
-
-class History(eqx.Module):
-    """What a solve remembers of its events from step to step."""
-
-    after_reset: BoolScalar  # whether the step begins at an event, or is the first one
-    # The conditions just before the last jump: their values, infinite where only the sign is known, and NaN
-    # for the one that caused it, which may have any sign after it.
-    sides: Float[Array, " resets"]
-    # Their largest values in the step before the jump, from which follows what is rounding after it. It is
-    # kept as long as a condition has not left zero since, and 0 then.
-    scale: Float[Array, " resets"]
-    happened: Int[Array, " resets"]  # how often each has happened
-    irregular: IntScalar  # how many had no derivative
-    failed: BoolScalar  # whether the state after the last jump could not be used
-
-    @staticmethod
-    def initial(count: int, dtype: Any) -> "History":
-        never, zero = jnp.zeros(count, jnp.int32), jnp.zeros((), jnp.int32)
-        unknown = jnp.zeros(count, dtype)
-        return History(jnp.asarray(True), unknown, unknown, never, zero, jnp.asarray(False))
-
-    @property
-    def remembers(self) -> Bool[Array, " resets"]:
-        """Which conditions begin the step as the last jump has left them."""
-        return self.after_reset | (self.scale > 0)
 
 
 class Found(NamedTuple):
@@ -104,7 +78,13 @@ class EventSearch(NamedTuple):
         rounding = jnp.finfo(step.t1.dtype).eps * jnp.maximum(jnp.abs(step.t0), jnp.abs(step.t1))
         at_end = roots >= self.end - 200 * rounding  # of the solve, where nothing happens any more
         roots = jnp.where(self.ignored | at_end | is_far, jnp.inf, roots)
-        near = self._is_at_end(step, samples, roots, noise, rounding) & ~at_once
+        tolerance = self._same_time(step, samples, noise, rounding)
+        is_at_known = self._is_at_known_time(step, roots, tolerance)
+        roots = jnp.where(is_at_known & ~self.is_known, jnp.min(self.known_times), roots)
+        # At a known time the value is the one after the jump: a step that ends there is made again.
+        exactly = step.t1 == _end_of_step(roots, step.t0)
+        is_end = jnp.where(is_at_known, exactly, jnp.abs(roots - step.t1) <= tolerance)
+        near = is_end & ~at_once
         irregular = self._is_irregular(samples, near & ~hops, at_once & on_surface)
         # What jumps have caused already, or is at the same time, stays so until its own jump.
         infinite = lambda sign: jnp.where(sign == 0, 0, sign * jnp.inf)
@@ -166,22 +146,25 @@ class EventSearch(NamedTuple):
         roots = root_in_bracket(value, (fractions[place], start), (right, end), found)
         return jnp.where(found, step.t0 + roots * step.length, jnp.inf)
 
-    def _is_at_end(
-        self,
-        step: SearchedStep,
-        samples: SampledConditions,
-        roots: Array,
-        noise: Array,
-        rounding: Any,
-    ) -> Bool[Array, " resets"]:
-        """Return which roots are the end of the step, up to rounding."""
+    def _same_time(
+        self, step: SearchedStep, samples: SampledConditions, noise: Array, rounding: Any
+    ) -> Float[Array, " resets"]:
+        """Return by how much rounding may move the events."""
         rate = jnp.abs(samples.end - samples.before_end) * self.parts  # per step
         noise = noise / jnp.maximum(rate, 1e3 * noise + jnp.finfo(rate.dtype).tiny)
         noise = jnp.where(self.is_boolean, 1e-12, noise)
-        tolerance = 16 * rounding + jnp.abs(step.length) * noise
-        # At a known time the value is the one after the jump: a step that ends there is made again.
-        exactly = step.t1 == _end_of_step(roots, step.t0)
-        return jnp.where(self.is_known, exactly, jnp.abs(roots - step.t1) <= tolerance)
+        return 16 * rounding + jnp.abs(step.length) * noise
+
+    def _is_at_known_time(
+        self, step: SearchedStep, roots: Array, tolerance: Array
+    ) -> Bool[Array, " resets"]:
+        """Return which roots are the next known time, up to rounding if they are those of conditions."""
+        known = jnp.min(self.known_times)
+        # Stricter for other steps, so that none ends at the known time in vain, again and again.
+        ends_there = step.t1 == _end_of_step(known, step.t0)
+        near = jnp.where(ends_there, 4, 1) * tolerance
+        is_same = (roots >= known - near) & (roots <= known + near) & jnp.isfinite(known)
+        return self.is_known | is_same
 
     def _is_irregular(self, samples: SampledConditions, near: Array, touching: Array) -> Array:
         """Return which events have no derivative: more than one at a time, or zeros with almost no slope."""
@@ -191,7 +174,8 @@ class EventSearch(NamedTuple):
         grazes = jnp.abs((right * b + left * a) / (a + b)) <= 1e-3 * jnp.max(
             jnp.abs(samples.inside), axis=0
         )
-        several = jnp.sum(near & ~self.is_known) > 1
+        # Known times that coincide do so for all parameters; no crossing does.
+        several = (jnp.sum(near) > 1) & jnp.any(near & ~self.is_known)
         grazes &= ~self.is_boolean & ~self.is_known
         return jnp.where(near, grazes | several, touching)
 

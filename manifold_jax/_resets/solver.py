@@ -18,10 +18,11 @@ from .._linalg.newton import without_derivative
 from .._solver.base import AbstractManifoldSolver
 from .._solver.step.hook_state import memory_of, with_memory
 from .conditions import Conditions
+from .history import History
 from .jump import Jump, jump_at_end, vector_field
 from .met import Met, Report
 from .samples import SampledConditions, SearchedStep
-from .search import EventSearch, Found, History
+from .search import EventSearch, Found
 from .terminating import TerminatingEvents
 
 

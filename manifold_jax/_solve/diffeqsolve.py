@@ -110,7 +110,7 @@ def diffeqsolve(
         their sum over that of the displacements. For a tangent field it is as small as the tolerance;
         otherwise see [`tangent_field`][].
     - `num_nondifferentiable_resets`, with `resets`: how many of them have no derivative, because a
-        condition only touches zero, or because several conditions cross zero at one time.
+        condition only touches zero, or crosses it at the time of another event.
 
     **Raises:**
 
