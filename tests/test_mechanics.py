@@ -657,3 +657,20 @@ def test_a_consistent_start_has_the_nearest_velocities():
     np.testing.assert_allclose(J @ v.ravel(), 0, atol=1e-14)
     multipliers = np.linalg.lstsq(J.T, change)[0]
     np.testing.assert_allclose(J.T @ multipliers, change, rtol=0, atol=1e-13)
+
+
+@pytest.mark.parametrize("light", [1e-3, 1e-8])
+def test_a_light_body_between_heavy_ones_is_moved_to_rounding(light):
+    """What both joints do to it alone is larger than what is left by the ratio of the masses."""
+
+    def joints(t, q, args):
+        return jnp.stack([q[0] - q[1], jnp.sin(q[1]) - jnp.sin(q[2])])
+
+    masses = jnp.array([1.0, light, 3.0])
+    system = mj.MechanicalSystem(masses, joints, lambda t, q, v, args: -q)
+    start = jnp.array([0.4, 0.3, 0.2]), jnp.array([1.0, 0.0, 0.0])
+    (q, v), info = mj.project(system.constraint, 0.0, start)
+    assert info.residual < 1e-16
+    np.testing.assert_allclose(q, jnp.full(3, q[0]), rtol=1e-15)
+    np.testing.assert_allclose(v, jnp.full(3, 1 / masses.sum()), rtol=1e-7)
+    np.testing.assert_allclose(v, jnp.full(3, v[0]), rtol=1e-15)

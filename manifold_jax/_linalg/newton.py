@@ -41,6 +41,13 @@ class AbstractEquations(eqx.Module):
     def linearize(self, x: Float[Array, " n"]) -> LinearizedAtPoint:
         """Return the derivative of the residual with respect to the unknowns, at a point."""
 
+    def point_after(
+        self, x: Float[Array, " n"], z: Float[Array, " m"], dz: Float[Array, " m"]
+    ) -> Float[Array, " n"]:
+        """Return the point that belongs to `z + dz`, where `x` belongs to `z`."""
+        del x
+        return self.point(z + dz)
+
 
 class SquareSystem(AbstractEquations):
     """`function(z) = 0` for vectors; the function is a pytree."""
@@ -58,9 +65,10 @@ class SquareSystem(AbstractEquations):
 
 
 class Iterate(NamedTuple):
-    """The unknowns, their residual, and the state of the iteration."""
+    """The unknowns, their point and residual, and the state of the iteration."""
 
     z: Float[Array, " m"]
+    x: Float[Array, " n"]
     r: Float[Array, " m"]
     scaled_residual: FloatScalar  # max_i |r_i| / scale_i
     iterations: IntScalar
@@ -73,21 +81,20 @@ class _Search(NamedTuple):
     equations: AbstractEquations
     scale: Float[Array, " m"]
 
-    def at(self, z: Float[Array, " m"]) -> tuple[Float[Array, " m"], FloatScalar]:
-        r = self.equations.residual(self.equations.point(z))
-        return r, self.scaled(r)
+    def after(self, z: Float[Array, " m"], x: Float[Array, " n"], dz: Float[Array, " m"]) -> tuple:
+        """Return the first four fields of the iterate at `z + dz`."""
+        x = self.equations.point_after(x, z, dz)
+        r = self.equations.residual(x)
+        return z + dz, x, r, self.scaled(r)
 
     def scaled(self, r: Float[Array, " m"]) -> FloatScalar:
         return jnp.max(jnp.abs(r) / self.scale, initial=0)
 
     def lowered(self, state: Iterate, dz: Float[Array, " m"]) -> Iterate:
         """Return the step to `z - dz` if it lowers the residual, else the state as it was."""
-        z = state.z - dz
-        r, scaled_residual = self.at(z)
-        progress = scaled_residual < state.scaled_residual
-        best = jtu.tree_map(
-            lambda new, old: jnp.where(progress, new, old), (z, r, scaled_residual), state[:3]
-        )
+        following = self.after(state.z, state.x, -dz)
+        progress = following[-1] < state.scaled_residual
+        best = jtu.tree_map(lambda new, old: jnp.where(progress, new, old), following, state[:4])
         return Iterate(*best, state.iterations + 1, progress)  # pyright: ignore[reportCallIssue]
 
 
@@ -105,11 +112,12 @@ def chord(
     equations: AbstractEquations,
     linearization: LinearizedAtPoint,
     z: Float[Array, " m"],
+    x: Float[Array, " n"],
     r: Float[Array, " m"],
     scale: Float[Array, " m"],
     max_steps: int,
 ) -> Iterate:
-    """Simplified Newton iteration from `z` with residual `r`, with a single factorization. Two
+    """Simplified Newton iteration from `z` at `x` with residual `r`, with a single factorization. Two
     iterations are nearly always enough; for few equations they are written out, so that they fuse with
     the surrounding operations.
 
@@ -122,18 +130,19 @@ def chord(
     scaled_residual = search.scaled(r)
     needed = scaled_residual > rounding
     for _ in range(written_out):
-        z = jnp.where(needed, z - linearization.solve(r), z)
-        r, scaled_residual = search.at(z)
+        dz = jnp.where(needed, -linearization.solve(r), 0)
+        z, x, r, scaled_residual = search.after(z, x, dz)
     return jax.lax.while_loop(
         lambda s: (s.scaled_residual > rounding) & s.progress & (s.iterations < max_steps),
         lambda s: search.lowered(s, linearization.solve(s.r)),
-        Iterate(z, r, scaled_residual, jnp.asarray(written_out, jnp.int32), jnp.asarray(True)),
+        Iterate(z, x, r, scaled_residual, jnp.asarray(written_out, jnp.int32), jnp.asarray(True)),
     )
 
 
 def damped_newton(
     equations: AbstractEquations,
     z: Float[Array, " m"],
+    x: Float[Array, " n"],
     r: Float[Array, " m"],
     scale: Float[Array, " m"],
     max_steps: int,
@@ -151,11 +160,11 @@ def damped_newton(
 
     def advance(carry: tuple[Iterate, FloatScalar]) -> tuple[Iterate, FloatScalar]:
         s, damping = carry
-        dz = equations.linearize(equations.point(s.z)).solve(s.r)
+        dz = equations.linearize(s.x).solve(s.r)
         s = search.lowered(s, damping * dz)
         return s, jnp.where(s.progress, jnp.ones_like(damping), damping / 4)
 
-    start = Iterate(z, r, search.scaled(r), jnp.zeros((), jnp.int32), jnp.asarray(True))
+    start = Iterate(z, x, r, search.scaled(r), jnp.zeros((), jnp.int32), jnp.asarray(True))
     return jax.lax.while_loop(unfinished, advance, (start, jnp.ones_like(start.scaled_residual)))[0]
 
 
@@ -168,8 +177,9 @@ def find_root(
     """Return the best unknowns found, by `max_i |r_i|`, without their derivative. Simple roots are
     found to rounding. Ends where no step lowers a residual that is below the tolerance."""
     equations, guess = without_derivative((equations, guess))
-    r = equations.residual(equations.point(guess))
-    return damped_newton(equations, guess, r, jnp.ones_like(r), max_steps, tolerance).z
+    x = equations.point(guess)
+    r = equations.residual(x)
+    return damped_newton(equations, guess, x, r, jnp.ones_like(r), max_steps, tolerance).z
 
 
 class ImplicitTangent(NamedTuple):

@@ -111,7 +111,7 @@ def _solve(equations: Callable, guess: Array, sizes: Array) -> tuple[Array, Bool
     system = SquareSystem(convert_closure(equations, guess))
     fixed = without_derivative(system)
     linearization = fixed.linearize(guess)
-    root = chord(fixed, linearization, guess, fixed.residual(guess), sizes, _MOST)
+    root = chord(fixed, linearization, guess, guess, fixed.residual(guess), sizes, _MOST)
     # With masses of a bad condition, as those of a long chain in its angles, rounding leaves more of the
     # residual than elsewhere; it no longer shrinks then.
     stalled = ~root.progress & (root.scaled_residual <= float(jnp.finfo(guess.dtype).eps) ** 0.75)

@@ -117,7 +117,7 @@ class _Step(NamedTuple):
         fixed, guess = without_derivative((system, guess))
         linearization = fixed.linearize(guess)
         sizes = lax.stop_gradient(jnp.concatenate([jnp.abs(y) + 1, scale]))
-        root = chord(fixed, linearization, guess, fixed.residual(guess), sizes, _MOST)
+        root = chord(fixed, linearization, guess, guess, fixed.residual(guess), sizes, _MOST)
         success = root.scaled_residual <= NewtonProjection().tolerance_for(y.dtype)
         z = implicit_root(system, jnp.where(success, root.z, guess))
         end = start.y.plus(increment(z)[0])
