@@ -348,28 +348,28 @@ def test_actuators_of_a_group_that_is_switched_off():
 
 
 FLAGGED = """<mujoco><option><flag {}="disable" gravity="disable"/></option><worldbody><body>
-<joint name="j" {}/><inertial pos="0 0 0" mass="1" diaginertia="1 1 2"/></body></worldbody>
-<actuator><motor joint="j" ctrlrange="-1 1" ctrllimited="true"/></actuator></mujoco>"""
+<joint name="j" stiffness="2" springref="90" damping="3"/>
+<inertial pos="0 0 0" mass="1" diaginertia="1 1 2"/></body></worldbody>
+<tendon><fixed stiffness="0.4" damping="0.7"><joint joint="j" coef="1"/></fixed></tendon><actuator><motor joint="j" ctrlrange="-1 1" ctrllimited="true"/></actuator></mujoco>"""
 
 
 @pytest.mark.parametrize(
-    ("flag", "expected"), [("clampctrl", 1.25), ("spring", 0.5), ("damper", 0.5)]
+    ("flag", "clamped", "sprung", "damped"),
+    [("clampctrl", 2.5, 1, 1), ("spring", 1, 0, 1), ("damper", 1, 1, 0)],
 )
-def test_flags(flag, expected):
-    """Controls may be meant beyond their limits; disabled springs are none where the file has none."""
-    damped = 'damping="0"' if flag == "damper" else 'stiffness="0"'
-    model = mujoco.MjModel.from_xml_string(FLAGGED.format(flag, damped))
-    data = mujoco.MjData(model)
-    data.ctrl[:] = 2.5
+def test_flags(flag, clamped, sprung, damped):
+    """Controls beyond their limits, no springs, or no dampers, of joints and of tendons."""
+    model = mujoco.MjModel.from_xml_string(FLAGGED.format(flag))
+    data, angle, rate = mujoco.MjData(model), 0.3, 0.9
+    data.ctrl[:], data.qpos[:], data.qvel[:] = 2.5, angle, rate
     mujoco.mj_forward(model, data)
     joints = mb.JointCoordinates(mb.from_mujoco(model, control=lambda t, args: args))
-    found = joints.terms.vf(0.0, joints.state(), jnp.array([2.5]))[1]
+    y = jnp.array([angle]), jnp.array([rate])
+    found = joints.terms.vf(0.0, y, jnp.array([2.5]))[1]
+    springs, dampers = 2 * (np.pi / 2 - angle) - 0.4 * angle, -(3 + 0.7) * rate
     np.testing.assert_allclose(found, data.qacc, rtol=1e-12)
+    expected = (clamped + sprung * springs + damped * dampers) / 2
     np.testing.assert_allclose(found, [expected], rtol=1e-12)
-    if flag != "clampctrl":
-        xml = FLAGGED.format(flag, damped.replace("0", "1"))
-        with pytest.raises(ValueError, match=f"disabled springs or dampers: flag {flag}"):
-            mb.from_mujoco(xml)
 
 
 def test_contacts_that_the_file_excludes():

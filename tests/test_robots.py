@@ -279,6 +279,18 @@ def test_a_joint_that_mimics_another():
         mb.read_urdf(file.replace('mimic joint="turn"', 'mimic joint="arm"'), **given)
 
 
+@pytest.mark.parametrize(
+    ("parent", "child", "floating"), [("base", "ground", False), ("ground", "arm", True)]
+)
+def test_links_that_move_are_not_called_ground(parent, child, floating):
+    links = cases.link(parent, 1.0, 0.1) + cases.link(child, 1.0, 0.1)
+    file = f"<robot name='r'>{links}{cases.joint('j', 'continuous', parent, child)}</robot>"
+    with pytest.raises(ValueError, match="the link 'ground' moves, .* Rename the link"):
+        mb.read_urdf(file, floating_base=floating)
+    fixed = file.replace("ground", "world").replace("base", "ground")
+    assert mb.read_urdf(fixed).assembly.joint_names == ("j",)  # where it does not move
+
+
 CHANGES = {  # of the file and the arguments, and what is said
     "gap": (
         ("0 0 0.4", "0 0 1.4"),

@@ -79,7 +79,8 @@ class Body(eqx.Module):
     ):
         if not isinstance(name, str) or not name or name == GROUND:
             raise ValueError(
-                f"`name` of a body must be a string and not {GROUND!r}, which is what does not move, got {name!r}."
+                f"`name` of a body must be a string and not {GROUND!r}, which is what does not move, got {name!r}. Rename "
+                "it, in the file if it is read from one."
             )
         self.name = name
         what = f"Body {name!r}"

@@ -13,7 +13,9 @@ from .contacts import stops_at
 from .forces import AbstractForce, JointSpring, RotationalDamper, RotorInertia
 from .joints import AbstractRestraint
 from .mujoco_actuators import actuators, tendon_springs
-from .mujoco_checks import disabled, import_mujoco, limited_joints, name_of, refuse_unsupported
+from .mujoco_checks import refuse_unsupported
+from .mujoco_equalities import equalities
+from .mujoco_model import disabled, import_mujoco, in_effect, limited_joints, name_of
 from .mujoco_state import drawing_of
 from .mujoco_tree import Tree
 
@@ -48,7 +50,7 @@ def from_mujoco(
 
     Read are bodies with their inertias and any number of hinge, slide and ball joints each, or a free one;
     stiffness, damping and armature of hinges and slides, damping of ball joints; `equality` of the types connect,
-    weld and joint; gravity; fixed tendons; actuators of hinges, slides and fixed tendons with constant gain and affine
+    weld and joint; gravity; the flags that switch off any of these; fixed tendons; actuators of hinges, slides and fixed tendons with constant gain and affine
     bias (motor, position, velocity, damper). The drawing is the pose `qpos0`, with coupled joints where their couplings have them.
 
     Angles of hinges that springs, servo motors (position actuators) and tendons turn beyond `pi` are those of MuJoCo in
@@ -75,6 +77,7 @@ def from_mujoco(
     tree = Tree(mujoco, model, drawing_of(mujoco, model), named)
     gravity = np.zeros(3) if disabled(mujoco, model, "GRAVITY") else model.opt.gravity
     bodies, own = tree.bodies(), tree.joints()
+    taken = {joint.name for joint in own if joint.name is not None}
     if not bodies:
         raise ValueError(
             "`model` has no body that moves: joints and free bodies belong in its `worldbody`."
@@ -83,7 +86,7 @@ def from_mujoco(
     acting += stops_at(stops, {tree.joint_of[j]: _limits(tree, j) for j in limited})
     return Assembly(
         bodies,
-        [*own, *tree.equalities(), *joints],
+        [*own, *equalities(tree, taken), *joints],
         [*acting, *forces],
         gravity=gravity,
         redundant=redundant,
@@ -110,9 +113,10 @@ def _limits(tree: Tree, j: int) -> tuple[float, float]:
 
 def _passive_forces(tree: Tree) -> list[AbstractForce]:
     """Return springs, dampers and rotors of joints."""
-    model, found = tree.model, []
+    mujoco, model, found = tree.mujoco, tree.model, []
+    stiffnesses, dampings = (in_effect(mujoco, model, n) for n in ("jnt_stiffness", "dof_damping"))
     for j, name in tree.joint_of.items():
-        stiffness, damping = model.jnt_stiffness[j], model.dof_damping[model.jnt_dofadr[j]]
+        stiffness, damping = stiffnesses[j], dampings[model.jnt_dofadr[j]]
         at = model.jnt_qposadr[j]
         if stiffness != 0 or damping != 0:
             rest = model.qpos_spring[at] - tree.drawing.qpos[at]
@@ -120,7 +124,8 @@ def _passive_forces(tree: Tree) -> list[AbstractForce]:
         if (armature := model.dof_armature[model.jnt_dofadr[j]]) != 0:
             found.append(RotorInertia(name, armature))  # pyright: ignore[reportArgumentType, reportCallIssue]
     for j, (parent, body) in tree.balls.items():
-        if (damping := model.dof_damping[model.jnt_dofadr[j]]) != 0:
+        damping, *others = dampings[model.dof_jntid == j]
+        if damping != 0 and all(damping == other for other in others):
             name = f"damping of {tree.name('joint', j)}"
             found.append(RotationalDamper(parent, body, damping, name))  # pyright: ignore[reportCallIssue]
     return found

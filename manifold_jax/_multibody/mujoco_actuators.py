@@ -11,7 +11,8 @@ from jaxtyping import Array, Float
 from .._base.types import Args, RealScalarLike
 from .checks import AbstractBounded, floating
 from .forces import AbstractForce, Motor, Tendon
-from .mujoco_checks import actuator_fault, disabled, is_of_tendon, tendon_fault
+from .mujoco_checks import actuator_fault, is_of_tendon, tendon_fault
+from .mujoco_model import disabled, in_effect
 from .mujoco_tree import Tree
 
 
@@ -42,23 +43,25 @@ def _group_disabled(model: Any, i: int) -> bool:
 def _actuator(tree: Tree, control: Callable | None, i: int) -> list[AbstractForce]:
     model, name = tree.model, tree.name("actuator", i)
     joints, coefficients, zero = _transmission(tree, i)
-    gear, gain = float(model.actuator_gear[i, 0]), float(model.actuator_gainprm[i, 0])
+    # actuators before it may have several controls and forces, if they are ignored
+    at, own = int(model.actuator_ctrladr[i]), model.actuator_outadr[i]
+    gear, gain = float(model.actuator_gear[own, 0]), float(model.actuator_gainprm[i, 0])
     affine = int(tree.mujoco.mjtBias.mjBIAS_AFFINE)
     bias = model.actuator_biasprm[i, :3] * (model.actuator_biastype[i] == affine)
-    least, most = map(float, model.actuator_ctrlrange[i])
-    is_clamped = model.actuator_ctrllimited[i] and not disabled(tree.mujoco, model, "CLAMPCTRL")
+    least, most = map(float, model.actuator_ctrlrange[at])
+    is_clamped = model.actuator_ctrllimited[at] and not disabled(tree.mujoco, model, "CLAMPCTRL")
     limits = (least, most) if is_clamped else (-np.inf, np.inf)
     is_limited = bool(model.actuator_forcelimited[i])
     is_servo = bias[1] != 0 or bias[2] != 0
     if len(joints) > 1 or is_limited or is_servo:
-        drive = _Drive(control, int(model.actuator_ctrladr[i]), gain, limits, float(bias[0]))
+        drive = _Drive(control, at, gain, limits, float(bias[0]))
         spring = dict(stiffness=-bias[1], rest=-gear * zero, damping=-bias[2])
         bounds = tuple(map(float, model.actuator_forcerange[i])) if is_limited else None
         return [_TENDON(joints, gear * coefficients, drive, **spring, limits=bounds, name=name)]
     joint = next(iter(joints))
     gear *= float(coefficients[0])
     constant = gear * float(bias[0])
-    drive = _Drive(control, int(model.actuator_ctrladr[i]), gear * gain, limits, constant)
+    drive = _Drive(control, at, gear * gain, limits, constant)
     return [_MOTOR(joint, drive, name=name)]
 
 
@@ -81,17 +84,23 @@ def _tendon(tree: Tree, k: int) -> tuple[tuple[str, ...], np.ndarray, float]:
 
 
 def tendon_springs(tree: Tree) -> list[AbstractForce]:
-    """Return the springs and dampers of fixed tendons."""
+    """Return the springs and dampers of fixed tendons, with other names than actuators have."""
     model, found = tree.model, []
+    taken = {tree.name("actuator", i) for i in range(model.nactuator)}
+    names = "tendon_stiffness", "tendon_damping"
+    stiffnesses, dampings = (in_effect(tree.mujoco, model, name) for name in names)
     for k in range(model.ntendon):
-        stiffness, damping = model.tendon_stiffness[k], model.tendon_damping[k]
+        stiffness, damping = stiffnesses[k], dampings[k]
         if (stiffness == 0 and damping == 0) or tendon_fault(tree.mujoco, model, k):
             continue
         joints, coefficients, zero = _tendon(tree, k)
         spring = dict(
             stiffness=stiffness, rest=model.tendon_lengthspring[k, 0] - zero, damping=damping
         )
-        found.append(_TENDON(joints, coefficients, **spring, name=tree.name("tendon", k)))
+        name = tree.name("tendon", k)
+        while name in taken:  # names of MuJoCo are unique among elements of one type alone
+            name = f"tendon {name}"
+        found.append(_TENDON(joints, coefficients, **spring, name=name))
     return found
 
 

@@ -5,11 +5,11 @@ from typing import Any
 
 import numpy as np
 
+from .mujoco_model import disabled, in_effect, Index, limited_joints, name_of
 
-Index = int | np.integer
 
 # Attribute of the model, the kind of element its entries belong to, and the user's name for it. Any
-# nonzero entry is refused. With the names of older and newer versions.
+# nonzero entry is refused, unless a flag switches it off.
 REFUSED = (
     ("jnt_limited", "joint", "joint limit"),
     ("jnt_actfrclimited", "joint", "actuator force limit"),
@@ -21,6 +21,7 @@ REFUSED = (
     ("tendon_actfrclimited", "tendon", "actuator force limit"),
     ("actuator_armature", "actuator", "armature"),
     ("actuator_damping", "actuator", "actuator damping"),
+    ("actuator_dampingpoly", "actuator", "actuator damping"),
     ("actuator_delay", "actuator", "actuator delay"),
 )
 COUNTED = (
@@ -32,7 +33,7 @@ OTHERS = (
     "contact",
     "tendon",
     "fluid",
-    "disabled springs or dampers",
+    "sleep",
     "damping of several coordinates",
     "stiffness of several coordinates",
     "armature of several coordinates",
@@ -46,32 +47,6 @@ OTHERS = (
 HINT = "Remove them, or leave them out of the motion by `ignore=(...)` with some of {words}."
 
 
-def import_mujoco() -> Any:
-    try:
-        import mujoco
-    except ImportError:
-        raise ImportError(
-            'MJCF and URDF are read by MuJoCo: `pip install "manifold_jax[mjcf]"`.'
-        ) from None
-    return mujoco
-
-
-def name_of(mujoco: Any, model: Any, kind: str, i: Index) -> str:
-    """Return the name of an element; `"body 3"` for one without."""
-    if kind == "dof":
-        kind, i = "joint", model.dof_jntid[i]
-    code = getattr(mujoco.mjtObj, f"mjOBJ_{kind.upper()}")
-    return mujoco.mj_id2name(model, code, int(i)) or f"{kind} {i}"
-
-
-def limited_joints(mujoco: Any, model: Any) -> list[int]:
-    """Return the hinges and slides with limits."""
-    if disabled(mujoco, model, "LIMIT"):
-        return []
-    has_one_coordinate = model.jnt_type >= int(mujoco.mjtJoint.mjJNT_SLIDE)
-    return [int(j) for j in np.flatnonzero((model.jnt_limited != 0) & has_one_coordinate)]
-
-
 def refuse_unsupported(
     mujoco: Any, model: Any, ignore: Sequence[str], has_stops: bool = False
 ) -> None:
@@ -83,8 +58,9 @@ def refuse_unsupported(
     stopped = limited_joints(mujoco, model) if has_stops else []
     allowed = {("joint limit", name_of(mujoco, model, "joint", j)) for j in stopped}
     for word, name in _unsupported(mujoco, model):
-        if word not in ignore and (word, name) not in allowed:
-            found.setdefault(word, []).append(name)
+        if word in ignore or (word, name) in allowed or name in found.get(word, ()):
+            continue
+        found.setdefault(word, []).append(name)
     if found:
         listed = "; ".join(
             f"{word}: {', '.join(names[:5])}{', ...' if len(names) > 5 else ''}"
@@ -110,33 +86,20 @@ def _check_words(ignore: Sequence[str]) -> None:
 
 def _unsupported(mujoco: Any, model: Any) -> Iterator[tuple[str, str]]:
     for attribute, kind, word in REFUSED:
-        entries = np.asarray(getattr(model, attribute, np.zeros(0)))
-        if attribute == "jnt_limited" and disabled(mujoco, model, "LIMIT"):
-            continue
-        if attribute == "dof_frictionloss" and disabled(mujoco, model, "FRICTIONLOSS"):
-            continue
-        rows = entries.reshape(entries.shape[0], -1) if entries.size else np.zeros((0, 1))
-        for i in np.flatnonzero(np.any(rows != 0, axis=1)):
+        entries = in_effect(mujoco, model, attribute)
+        is_given = np.any(entries != 0, axis=tuple(range(1, entries.ndim)))
+        for i in np.flatnonzero(is_given):
             yield word, name_of(mujoco, model, kind, i)
     for count, word in COUNTED:
-        for i in range(getattr(model, count, 0)):
+        for i in range(getattr(model, count)):
             yield word, f"{word} {i}"
     yield from _forces_of_joints(mujoco, model)
     yield from _elements(mujoco, model)
     yield from _contacts(mujoco, model)
     if model.opt.density != 0 or model.opt.viscosity != 0:
         yield "fluid", "density and viscosity of option"
-    for flag, of_joints, of_tendons in (
-        ("SPRING", model.jnt_stiffness, model.tendon_stiffness),
-        ("DAMPER", model.dof_damping, model.tendon_damping),
-    ):
-        if disabled(mujoco, model, flag) and (np.any(of_joints != 0) or np.any(of_tendons != 0)):
-            yield "disabled springs or dampers", f"flag {flag.lower()}"
-
-
-def disabled(mujoco: Any, model: Any, flag: str) -> bool:
-    bit = getattr(mujoco.mjtDisableBit, f"mjDSBL_{flag}", 0)
-    return bool(model.opt.disableflags & int(bit))
+    if model.opt.enableflags & int(mujoco.mjtEnableBit.mjENBL_SLEEP):
+        yield "sleep", "flag sleep"
 
 
 def _with_one_coordinate(mujoco: Any, model: Any, joint: Index) -> bool:
@@ -147,17 +110,20 @@ def _with_one_coordinate(mujoco: Any, model: Any, joint: Index) -> bool:
 def _forces_of_joints(mujoco: Any, model: Any) -> Iterator[tuple[str, str]]:
     """Refuse springs, dampers and rotors of joints that have no single coordinate here."""
     ball = int(mujoco.mjtJoint.mjJNT_BALL)
+    of_dofs, of_joints = (
+        in_effect(mujoco, model, name) for name in ("dof_damping", "jnt_stiffness")
+    )
     for joint in range(model.njnt):
         if _with_one_coordinate(mujoco, model, joint):
             continue
         name, own = name_of(mujoco, model, "joint", joint), model.dof_jntid == joint
-        damping, armature = model.dof_damping[own], model.dof_armature[own]
+        damping, armature = of_dofs[own], model.dof_armature[own]
         is_isotropic = int(model.jnt_type[joint]) == ball and np.ptp(damping) == 0
         if np.any(damping != 0) and not is_isotropic:
             yield "damping of several coordinates", name
         if np.any(armature != 0):
             yield "armature of several coordinates", name
-        if model.jnt_stiffness[joint] != 0:
+        if of_joints[joint] != 0:
             yield "stiffness of several coordinates", name
 
 
@@ -187,18 +153,10 @@ def tendon_fault(mujoco: Any, model: Any, k: Index) -> str | None:
     """Return the reason why a tendon is not supported, if there is one: it is fixed, and has a spring and a damper."""
     own = slice(model.tendon_adr[k], model.tendon_adr[k] + model.tendon_num[k])
     is_fixed = np.all(model.wrap_type[own] == int(mujoco.mjtWrap.mjWRAP_JOINT))
-    has_slack = model.tendon_stiffness[k] != 0 and np.ptp(model.tendon_lengthspring[k]) != 0
-    others = [
-        np.any(getattr(model, f"tendon_{word}", np.zeros(k + 1))[k] != 0)
-        for word in (
-            "limited",
-            "frictionloss",
-            "armature",
-            "stiffnesspoly",
-            "dampingpoly",
-            "springyield",
-        )
-    ]
+    value = lambda word: in_effect(mujoco, model, f"tendon_{word}")[k]
+    has_slack = value("stiffness") != 0 and np.ptp(model.tendon_lengthspring[k]) != 0
+    words = "limited", "frictionloss", "armature", "stiffnesspoly", "dampingpoly", "springyield"
+    others = [np.any(value(word) != 0) for word in words]
     return "tendon" if not is_fixed or has_slack or any(others) else None
 
 
@@ -218,21 +176,21 @@ def _elements(mujoco: Any, model: Any) -> Iterator[tuple[str, str]]:
     for k in range(model.ntendon):
         if fault := tendon_fault(mujoco, model, k):
             yield fault, name_of(mujoco, model, "tendon", k)
-    for e in range(model.neq):
+    for e in range(0 if disabled(mujoco, model, "EQUALITY") else model.neq):
         fault = equality_fault(mujoco, model, e)
         if fault and model.eq_active0[e]:
             yield fault, name_of(mujoco, model, "equality", e)
 
 
 def _contacts(mujoco: Any, model: Any) -> Iterator[tuple[str, str]]:
-    """Return the first geometry that may touch another; those of one body, and of a body and its moving
-    parent, do not."""
+    """Return the geometries that may touch another; those of one body do not, nor those of a body and its moving
+    parent, unless a flag says so."""
     if disabled(mujoco, model, "CONTACT"):
         return
     if model.npair > 0:
         yield "contact", "explicit pairs"
     welded, parents = model.body_weldid, model.body_parentid
-    body = welded[model.geom_bodyid]
+    body, filtered = welded[model.geom_bodyid], not disabled(mujoco, model, "FILTERPARENT")
     for i in range(model.ngeom):
         touches = (model.geom_contype[i] & model.geom_conaffinity) | (
             model.geom_contype & model.geom_conaffinity[i]
@@ -241,6 +199,6 @@ def _contacts(mujoco: Any, model: Any) -> Iterator[tuple[str, str]]:
         parent = (welded[parents[a]] == b) | (welded[parents[b]] == a)
         pair = np.sort(np.stack([model.geom_bodyid, 0 * b + model.geom_bodyid[i]]), axis=0)
         excluded = np.isin((pair[0] << 16) + pair[1], model.exclude_signature)
-        related = excluded | (a == b) | (parent & (a != 0) & (b != 0))
+        related = excluded | (a == b) | (filtered & parent & (a != 0) & (b != 0))
         if np.any((touches != 0) & ~related):
             yield "contact", name_of(mujoco, model, "geom", i)

@@ -8,7 +8,7 @@ import numpy as np
 from .assembly import Assembly
 from .bodies import Pose
 from .checks import floating
-from .mujoco_checks import disabled, import_mujoco, Index, name_of
+from .mujoco_model import disabled, import_mujoco, Index, name_of
 from .rotations import quaternion_rate
 
 

@@ -8,18 +8,16 @@ import numpy as np
 from .bodies import Body, GROUND
 from .joints import (
     AbstractJoint,
-    AbstractRestraint,
-    Coupling,
     Cylindrical,
-    Drive,
     Fixed,
     Prismatic,
     Revolute,
     Spherical,
     Universal,
 )
-from .mujoco_checks import actuator_fault, disabled, equality_fault, Index, is_of_tendon, name_of
-from .mujoco_state import active_couplings, coefficients_of, link_names, quaternion_of
+from .mujoco_checks import actuator_fault, is_of_tendon
+from .mujoco_model import in_effect, Index, name_of
+from .mujoco_state import active_couplings, link_names, quaternion_of
 
 
 class Tree:
@@ -36,12 +34,17 @@ class Tree:
 
     def body(self, i: Index) -> str:
         """Return the name of the body that body `i` is part of."""
+        i = self.whole(i)
+        return GROUND if i == 0 else self.name("body", i)
+
+    def whole(self, i: Index) -> Index:
+        """Return the number of the body that body `i` is part of, 0 for the ground."""
         model = self.model
         if model.body_weldid[i] == 0:
-            return GROUND
-        while model.body_mass[i] == 0 and model.body_jntnum[i] == 0:
+            return 0
+        while i != 0 and model.body_mass[i] == 0 and model.body_jntnum[i] == 0:
             i = model.body_parentid[i]
-        return self.name("body", i)
+        return i
 
     def bodies(self) -> list[Body]:
         return [link for i in self._moving() for link in self._links(i)]
@@ -51,8 +54,7 @@ class Tree:
 
     def _moving(self) -> list[int]:
         """Return the bodies that are not parts of others."""
-        bodies = range(1, self.model.nbody)
-        return [i for i in bodies if self.body(i) == self.name("body", i)]
+        return [i for i in range(1, self.model.nbody) if self.whole(i) == i]
 
     def _links(self, i: Index) -> list[Body]:
         """Return a body, after the links without mass between its joints."""
@@ -63,7 +65,17 @@ class Tree:
         *between, name = link_names(self.mujoco, model, i)
         between = [] if self._joint_of_two(i) else between
         links = [Body(link, 0.0, np.zeros(3), **place) for link in between]
-        return [*links, Body(name, model.body_mass[i], model.body_inertia[i], **place)]
+        return [*links, Body(name, model.body_mass[i], self._inertia(i), **place)]
+
+    def _inertia(self, i: Index) -> np.ndarray:
+        """Return the inertia of a body, with those of its parts, which have no mass but may have an inertia."""
+        own, frames = self.model.body_inertia, self.drawing.ximat.reshape(-1, 3, 3)
+        found = np.diag(own[i])
+        for k in range(1, self.model.nbody):
+            if k != i and self.whole(k) == i:
+                turned = frames[i].T @ frames[k]
+                found = found + turned @ np.diag(own[k]) @ turned.T
+        return found
 
     def _joints(self, i: Index) -> list[AbstractJoint]:
         model, drawing = self.model, self.drawing
@@ -112,7 +124,11 @@ class Tree:
     def _is_acted_on(self, j: int) -> bool:
         """Return whether a spring, damper, rotor, actuator or coupling needs the coordinate of the joint."""
         model, first = self.model, self.model.jnt_dofadr[j]
-        passive = model.jnt_stiffness[j], model.dof_damping[first], model.dof_armature[first]
+        stiffness, damping = (
+            in_effect(self.mujoco, model, name)[at]
+            for name, at in (("jnt_stiffness", j), ("dof_damping", first))
+        )
+        passive = stiffness, damping, model.dof_armature[first]
         moved = [
             model.actuator_trnid[a, 0]
             for a in range(model.nactuator)
@@ -122,57 +138,3 @@ class Tree:
         coupled = [k for _, *pair in active_couplings(self.mujoco, model) for k in pair]
         is_named = self.name("joint", j) in self.named
         return is_named or any(value != 0 for value in passive) or j in moved or j in coupled
-
-    def equalities(self) -> list[AbstractRestraint]:
-        model = self.model
-        if disabled(self.mujoco, model, "EQUALITY"):
-            return []
-        active = np.flatnonzero(model.eq_active0)
-        return [self._equality(e) for e in active if not equality_fault(self.mujoco, model, e)]
-
-    def _equality(self, e: Index) -> AbstractRestraint:
-        """Convert an equality constraint of two joints, or of two bodies or sites, each with a point in its frame:
-        a connect keeps the points together, a weld also the frames, which must coincide in the drawing."""
-        model, drawing, mujoco = self.model, self.drawing, self.mujoco
-        if int(model.eq_type[e]) == int(mujoco.mjtEq.mjEQ_JOINT):
-            return self._coupling(e)
-        name, data = self.name("equality", e), model.eq_data[e]
-        objects = bodies = model.eq_obj1id[e], model.eq_obj2id[e]
-        is_weld = int(model.eq_type[e]) == int(mujoco.mjtEq.mjEQ_WELD)
-        local = (data[3:6], data[0:3]) if is_weld else (data[0:3], data[3:6])
-        origins, frames, wanted = drawing.xpos, drawing.xmat, np.eye(3).ravel()
-        if int(model.eq_objtype[e]) == int(mujoco.mjtObj.mjOBJ_SITE):
-            bodies, local = [model.site_bodyid[i] for i in objects], np.zeros((2, 3))
-            origins, frames = drawing.site_xpos, drawing.site_xmat
-        elif is_weld:
-            mujoco.mju_quat2Mat(wanted, data[6:10])
-        first, second = (frames[i].reshape(3, 3) for i in objects)
-        one = origins[objects[0]] + first @ local[0]
-        other = origins[objects[1]] + second @ local[1]
-        if not is_weld:
-            points = self._in_body(bodies[0], one), self._in_body(bodies[1], other)
-            return Spherical(*map(self.body, bodies), points=points, name=name)
-        turned = first.T @ second - wanted.reshape(3, 3)
-        if max(np.abs(other - one).max(), np.abs(turned).max()) > 1e-6:
-            raise ValueError(
-                f"The weld {name!r} holds its bodies in another pose than that of `qpos0`, which is not supported: give them "
-                "in the file as they are welded."
-            )
-        return Fixed(*map(self.body, bodies), at=other, name=name)
-
-    def _coupling(self, e: Index) -> AbstractRestraint:
-        first, second = int(self.model.eq_obj1id[e]), int(self.model.eq_obj2id[e])
-        joint, name = self.joint_of[first], self.name("equality", e)
-        if second < 0:
-            return Drive(joint, 0.0, name=name)
-        coefficients = coefficients_of(self.model, self.drawing, e, second)
-        return Coupling(joint, self.joint_of[second], coefficients, name=name)
-
-    def _in_body(self, body: Index, point: np.ndarray) -> np.ndarray:
-        """Return the point in our frame of the body, that of its inertia."""
-        name = self.body(body)
-        if name == GROUND:
-            return point
-        while self.name("body", body) != name:
-            body = self.model.body_parentid[body]
-        return self.drawing.ximat[body].reshape(3, 3).T @ (point - self.drawing.xipos[body])

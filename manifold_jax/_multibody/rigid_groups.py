@@ -203,4 +203,9 @@ def body_names(
         for group in groups.members
         if (groups.mass(group) != 0 or group in connected) and group != root
     }
-    return {root: groups.body_name(root) if moves else GROUND, **names}
+    names = {root: groups.body_name(root), **names} if moves else names
+    if GROUND in names.values():
+        raise ValueError(
+            f"`file`: the link {GROUND!r} moves, but this is the name of what does not. Rename the link."
+        )
+    return names if moves else {root: GROUND, **names}
