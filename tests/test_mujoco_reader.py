@@ -124,3 +124,69 @@ def test_actuators_after_one_with_several_controls():
     (motor,) = robot.loads
     value = motor.laws.values.at(0.0, np.array([0.0, 0.0, 9.0]))
     np.testing.assert_allclose(value, [7 * 3.0])
+
+
+def coupled(*equalities):
+    """Three hinges side by side, and the positions from `qpos0` in which they are drawn."""
+    bodies = "".join(f'<body><joint name="j{i}" axis="0 1 0"/>{SOLID}</body>' for i in (1, 2, 3))
+    lines = "".join(
+        f'<joint name="{i}" joint1="j{one}" joint2="j{other}" polycoef="{a} {b} 0 0 0"/>'
+        for i, (one, a, b, other) in enumerate(equalities)
+    )
+    model = mujoco.MjModel.from_xml_string(
+        f"<mujoco><worldbody>{bodies}</worldbody><equality>{lines}</equality></mujoco>"
+    )
+    robot, data = mb.from_mujoco(model), mujoco.MjData(model)
+    # turned back from the drawing by so much to `qpos0`
+    turned = robot.joint_coordinates(mb.state_of_mujoco(robot, model, data))
+    return [-float(turned[f"j{i}"]) for i in (1, 2, 3)]
+
+
+def test_couplings_that_need_a_start():
+    """Equations of one joint by two others, nearest to zeros: by NumPy; and two of each other, `x = 0.1 + x / 2`."""
+    found = coupled((1, 0.1, 1, 2), (1, 0, 1, 3))
+    rows = np.array([[1.0, -1, 0], [1, 0, -1]])
+    np.testing.assert_allclose(found, np.linalg.pinv(rows) @ [0.1, 0], atol=1e-12)
+    found = coupled((1, 0.1, 0.5, 2), (2, 0.1, 0.5, 1))
+    np.testing.assert_allclose(found, [0.2, 0.2, 0], atol=1e-12)
+    with pytest.raises(ValueError, match=r"couplings of joints \['0', '1'\] contradict each other"):
+        coupled((1, 0.1, 1, 2), (2, 0.1, 1, 1))
+
+
+def test_names_that_mujoco_allows():
+    """They are unique among elements of one type alone."""
+    tendon = '<tendon><fixed name="m" stiffness="1"><joint joint="j" coef="1"/></fixed></tendon>'
+    gear = '<equality><joint name="j" joint1="k" joint2="j"/></equality>'
+    named = arm(parts=f"<body><joint/>{SOLID}</body>", more=tendon + MOTOR.format("") + gear)
+    robot = mb.from_mujoco(named)
+    assert robot.couplings.names == ("equality j",)
+    xml = f'<mujoco><worldbody><body><joint/>{SOLID}<body name="body 1"><joint/>{SOLID}</body></body></worldbody></mujoco>'
+    model = mujoco.MjModel.from_xml_string(xml)
+    robot = mb.from_mujoco(model)
+    assert robot.names == ("unnamed body 1", "body 1")
+    assert mb.state_of_mujoco(robot, model, mujoco.MjData(model))[0].position.shape == (2, 3)
+
+
+def test_an_affine_gain_that_is_constant():
+    general = '<actuator><general joint="j" gaintype="affine" gainprm="2 {} 0"/></actuator>'
+    robot = mb.from_mujoco(arm(more=general.format(0)), control=lambda t, args: args)
+    (motor,) = robot.loads
+    np.testing.assert_allclose(motor.laws.values.at(0.0, np.array([3.0])), [6.0])
+    with pytest.raises(ValueError, match="actuator gain that is not constant"):
+        mb.from_mujoco(arm(more=general.format(1)))
+
+
+def test_equalities_without_effect():
+    """Of two bodies that do not move, and of a body and its part: MuJoCo's Jacobian of them is zero."""
+    parts = f'<body name="part" pos="0 0 1">{SOLID}</body>'
+    still = '<body name="one"/><body name="two" pos="1 1 1"/></worldbody>'
+    equalities = """<equality><connect body1="one" body2="two" anchor="0 0 0"/><weld body1="two" body2="one"/>
+    <connect body1="hand" body2="part" anchor="0 0 0"/></equality>"""
+    xml = ARM.replace("</worldbody>", still).format(
+        flags="", joint="", solid=SOLID, touches=0, parts=parts, more=equalities
+    )
+    model = mujoco.MjModel.from_xml_string(xml.replace("<option>", '<option jacobian="dense">'))
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    assert not np.any(data.efc_J)
+    assert mb.from_mujoco(model).joint_names == ("j", "k", "weld of part")

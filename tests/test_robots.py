@@ -365,6 +365,7 @@ CHANGES = {  # of the file and the arguments, and what is said
         "the root link 'base' has no mass",
     ),
     "ignored": ((), {"ignore": ("mass",)}, r"`ignore` has \['mass'\]"),
+    "one word": ((), {"ignore": "mimic"}, r"sequence of words, write `ignore=\('mimic',\)`"),
 }
 
 

@@ -14,9 +14,9 @@ from .forces import AbstractForce, JointSpring, RotationalDamper, RotorInertia
 from .joints import AbstractRestraint
 from .mujoco_actuators import actuators, tendon_springs
 from .mujoco_checks import refuse_unsupported
+from .mujoco_drawing import drawing_of
 from .mujoco_equalities import equalities
 from .mujoco_model import disabled, import_mujoco, in_effect, limited_joints, name_of
-from .mujoco_state import drawing_of
 from .mujoco_tree import Tree
 
 
@@ -50,8 +50,13 @@ def from_mujoco(
 
     Read are bodies with their inertias and any number of hinge, slide and ball joints each, or a free one;
     stiffness, damping and armature of hinges and slides, damping of ball joints; `equality` of the types connect,
-    weld and joint; gravity; the flags that switch off any of these; fixed tendons; actuators of hinges, slides and fixed tendons with constant gain and affine
-    bias (motor, position, velocity, damper). The drawing is the pose `qpos0`, with coupled joints where their couplings have them.
+    weld and joint; gravity; fixed tendons; actuators of hinges, slides and fixed tendons with constant gain and affine
+    bias (motor, position, velocity); the flags that switch off any of these. The drawing is the pose `qpos0`, with coupled
+    joints where their couplings have them.
+
+    Names are those of the file, `"body 3"` for an element without. MuJoCo's are unique among elements of one type alone:
+    an equality that is called as a joint is `"equality j"` here, a tendon with a spring that is called as an actuator
+    `"tendon j"`, and `"unnamed body 3"` is one without a name where another has the name `"body 3"`.
 
     Angles of hinges that springs, servo motors (position actuators) and tendons turn beyond `pi` are those of MuJoCo in
     [`JointCoordinates`][] alone. Where `ctrlrange`, `range` or `springref` reach there, the poses of bodies are refused as

@@ -138,11 +138,18 @@ def actuator_fault(mujoco: Any, model: Any, i: Index) -> str | None:
     elif not _with_one_coordinate(mujoco, model, model.actuator_trnid[i, 0]):
         return "actuator of several coordinates"
     biases = {int(mujoco.mjtBias.mjBIAS_NONE), int(mujoco.mjtBias.mjBIAS_AFFINE)}
-    if int(model.actuator_gaintype[i]) != int(mujoco.mjtGain.mjGAIN_FIXED):
+    if not _has_constant_gain(mujoco, model, i):
         return "actuator gain that is not constant"
     if int(model.actuator_dyntype[i]) != int(mujoco.mjtDyn.mjDYN_NONE):
         return "actuator dynamics"
     return None if int(model.actuator_biastype[i]) in biases else "actuator bias that is not affine"
+
+
+def _has_constant_gain(mujoco: Any, model: Any, i: Index) -> bool:
+    """Whether the force is its control times a number, also where that could depend on length and velocity."""
+    is_flat = not np.any(model.actuator_gainprm[i, 1:3])
+    kinds = {int(mujoco.mjtGain.mjGAIN_FIXED): True, int(mujoco.mjtGain.mjGAIN_AFFINE): is_flat}
+    return kinds.get(int(model.actuator_gaintype[i]), False)
 
 
 def is_of_tendon(mujoco: Any, model: Any, i: Index) -> bool:

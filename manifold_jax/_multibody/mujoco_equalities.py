@@ -7,8 +7,8 @@ import numpy as np
 from .bodies import GROUND
 from .joints import AbstractRestraint, Coupling, Drive, Fixed, Spherical
 from .mujoco_checks import equality_fault
+from .mujoco_drawing import coefficients_of
 from .mujoco_model import disabled, Index
-from .mujoco_state import coefficients_of
 from .mujoco_tree import Tree
 
 

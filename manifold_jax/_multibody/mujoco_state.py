@@ -1,6 +1,5 @@
-"""Configurations of a MuJoCo model: the drawing of its assembly, and the states of this for those of the model."""
+"""States of an assembly for those of its MuJoCo model."""
 
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -8,51 +7,9 @@ import numpy as np
 from .assembly import Assembly
 from .bodies import Pose
 from .checks import floating
-from .mujoco_model import disabled, import_mujoco, Index, name_of
+from .mujoco_drawing import drawing_of
+from .mujoco_model import import_mujoco, Index, name_of
 from .rotations import quaternion_rate
-
-
-_MET = 1e-12
-
-
-def drawing_of(mujoco: Any, model: Any) -> Any:
-    """Return MuJoCo's data in `qpos0`, but with coupled joints where their couplings have them."""
-    drawing = mujoco.MjData(model)
-    couplings = list(active_couplings(mujoco, model))
-    for _ in range(len(couplings) + 1):
-        gaps = [0.0]
-        for e, first, second in couplings:
-            at = model.jnt_qposadr[first]
-            z = 0.0 if second < 0 else _from_reference(model, drawing, second)
-            value = model.qpos0[at] + np.polynomial.Polynomial(model.eq_data[e, :5])(z)
-            gaps.append(abs(value - drawing.qpos[at]))
-            drawing.qpos[at] = value
-        if max(gaps) < _MET:
-            mujoco.mj_kinematics(model, drawing)
-            mujoco.mj_comPos(model, drawing)
-            return drawing
-    names = [name_of(mujoco, model, "equality", e) for e, *_ in couplings]
-    raise ValueError(f"The couplings of joints {names[:12]} contradict each other in `qpos0`.")
-
-
-def active_couplings(mujoco: Any, model: Any) -> Iterator[tuple[int, int, int]]:
-    """Return the equalities of joints that are active, and their joints; the second is -1 for none."""
-    number = 0 if disabled(mujoco, model, "EQUALITY") else model.neq
-    for e in range(number):
-        if model.eq_active0[e] and int(model.eq_type[e]) == int(mujoco.mjtEq.mjEQ_JOINT):
-            yield e, int(model.eq_obj1id[e]), int(model.eq_obj2id[e])
-
-
-def coefficients_of(model: Any, drawing: Any, e: Index, second: int) -> list[float]:
-    """Return the coefficients of a coupling for coordinates that are zero in the drawing."""
-    moved = np.polynomial.Polynomial([_from_reference(model, drawing, second), 1.0])
-    polynomial = np.polynomial.Polynomial(model.eq_data[e, :5])(moved)
-    return (polynomial.trim().coef[1:] if polynomial.trim().degree() else np.zeros(1)).tolist()
-
-
-def _from_reference(model: Any, drawing: Any, joint: int) -> float:
-    at = model.jnt_qposadr[joint]
-    return float(drawing.qpos[at] - model.qpos0[at])
 
 
 def link_names(mujoco: Any, model: Any, i: Index) -> list[str]:

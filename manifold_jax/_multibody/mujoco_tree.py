@@ -16,8 +16,9 @@ from .joints import (
     Universal,
 )
 from .mujoco_checks import actuator_fault, is_of_tendon
+from .mujoco_drawing import active_couplings
 from .mujoco_model import in_effect, Index, name_of
-from .mujoco_state import active_couplings, link_names, quaternion_of
+from .mujoco_state import link_names, quaternion_of
 
 
 class Tree:

@@ -178,6 +178,8 @@ def _frames(
 
 def _supported(joints: Sequence[Joint], ignore: Sequence[str]) -> list[Joint]:
     """Return the joints without what is to be ignored."""
+    if isinstance(ignore, str):
+        raise TypeError(f"`ignore` must be a sequence of words, write `ignore=({ignore!r},)`.")
     if unknown := sorted(set(ignore) - {"friction", "mimic"}):
         raise ValueError(f"`ignore` has {unknown}; known are 'friction' and 'mimic'.")
     rubbing = [joint.name for joint in joints if joint.friction != 0]
