@@ -127,3 +127,24 @@ def test_contradictions_and_unannounced_redundancy_are_reported():
         mj.project(mj.Constraint(twice), 0.0, jnp.array([0.9, 0.2, 0.5]))
     with pytest.raises(ValueError, match="`constraint` is redundant"):
         mj.LocalCoordinates(dfx.Tsit5(), mj.Constraint(twice, redundant=True))
+
+
+@pytest.mark.parametrize("mass", [np.array([2.0, 1.0]), np.array([[2.0, 0.3], [0.3, 1.0]])])
+def test_equations_that_hold_identically(mass):
+    """Two masses that move as one, by -2 N over all the mass, at rest and in motion; the second equation has a
+    gradient of rounding."""
+    phi = lambda t, q, args: jnp.array([q[0] - q[1], 0.1 * q[0] + 0.7 * q[0] - 0.8 * q[0]])
+    force = lambda t, q, v, args: jnp.array([1.0, -3.0])
+    system = mj.MechanicalSystem(mass, phi, force, redundant=True)
+    both = lambda x: jnp.full(2, x)
+    states = jnp.array([(x, v) for x in (0.3, 0.7, 2.2) for v in (0.0, 1.0, -20.0)])
+    found = jax.vmap(lambda y: system.accelerations(0.0, (both(y[0]), both(y[1]))))(states)
+    np.testing.assert_allclose(found, np.full((9, 2), -2 / mass.sum()), rtol=1e-11)
+
+
+def test_a_contradiction_without_a_gradient_is_no_rounding():
+    """The second equation asks for an acceleration of one, of no coordinate."""
+    phi = lambda t, q, args: jnp.array([q[0] - q[1], t**2 / 2])
+    force = lambda t, q, v, args: jnp.array([1.0, -3.0])
+    system = mj.MechanicalSystem(np.diag([2.0, 1.0]), phi, force, redundant=True)
+    assert np.all(np.isnan(system.accelerations(0.0, (jnp.zeros(2), jnp.ones(2)))))

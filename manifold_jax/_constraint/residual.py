@@ -43,7 +43,9 @@ def row_scale(G: Rows, x: Float[Array, " n"], redundant: bool = False) -> Float[
     else:
         scale = jnp.max(jnp.abs(G) * (jnp.abs(x) + 1)[None, :], axis=1)
     if redundant:
+        # Of equations that hold identically; if all do, only the state tells how large their terms are.
         scale = jnp.where(is_rounding(scale), jnp.max(scale), scale)
+        scale = jnp.where(scale > 0, scale, jnp.max(jnp.abs(x)) + 1)
     return jnp.maximum(scale, jnp.finfo(scale.dtype).tiny)
 
 

@@ -14,6 +14,7 @@ from .._base.shapes import are_alike, shapes
 from .._base.types import Args, RealScalarLike, Y
 from .._base.user_functions import call_traced_once
 from .._constraint.residual import as_time, jacobian
+from .._linalg.dense import is_rounding
 from .._linalg.rows import AbstractRows, Rows
 from .._linalg.sparse import Choice, choose_structure, SparseRows, Structure
 from .mass import factorize_mass, InvertedBlocks, Mass, mass_values
@@ -101,7 +102,8 @@ class Kinematics(NamedTuple):
         return jax.jvp(velocity, (self.t, self.x), (jnp.ones_like(self.t), self.w))[1]
 
     def rows(self) -> tuple[Rows, int]:
-        """Return `C = [J; da/dv]`, and how many of its rows belong to positions."""
+        """Return `C = [J; da/dv]`, and how many of its rows belong to positions. Those of redundant equations
+        that are rounding are zero: of equations that hold identically."""
         t, x, w, args = self.t, self.x, self.w, self.args
         if (structure := self.structure_here()) is not None:
             p = jax.eval_shape(self.position, t, x, args).size
@@ -112,10 +114,13 @@ class Kinematics(NamedTuple):
             J = self.system.holonomic.jacobian(t, self.unravel(x), args)
         else:
             _, J = jacobian(lambda x: self.position(t, x, args), x)
-        if self.nonholonomic is None:
-            return J, J.shape[0]
-        nonholonomic = lambda w: self.velocity(t, w, (x, args))[J.shape[0] :]
-        return jnp.concatenate([J, jacobian(nonholonomic, w)[1]]), J.shape[0]
+        C = J
+        if self.nonholonomic is not None:
+            nonholonomic = lambda w: self.velocity(t, w, (x, args))[J.shape[0] :]
+            C = jnp.concatenate([J, jacobian(nonholonomic, w)[1]])
+        if self.system.redundant:
+            C = jnp.where(is_rounding(jnp.max(jnp.abs(C), axis=1))[:, None], 0, C)
+        return C, J.shape[0]
 
     def position_rows(self, C: Rows, p: int) -> Rows:
         """Return `J`, the first `p` of the rows `C`."""

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 
 from .._base.shapes import shapes
 from .._base.types import Args, BoolScalar, RealScalarLike, Y
-from .._linalg.dense import Factorization, factorize_positive, gram
+from .._linalg.dense import Factorization, factorize_positive, gram, is_rounding
 from .._linalg.rows import Rows
 from .._linalg.sparse import SparseRows
 
@@ -180,9 +180,11 @@ def _augmented(
 def _weights(M: Float[Array, "n n"], C: Float[Array, "m n"]) -> Float[Array, " m"]:
     """Return the diagonal of `D`, `1 / (C diag(M)^-1 C^T)_ii`: then no entry of `C_i^T D_i C_i` exceeds
     `sqrt(M_jj M_kk)`, and light bodies keep their digits beside heavy ones. Diagonal entries that are
-    zero to rounding count as the mean."""
+    zero to rounding count as the mean. Zero for rows that are rounding: of redundant equations these are
+    not solved, and `C_i^T D_i C_i` would be as large as masses."""
     size = jnp.sum(C * C / _masses(M)[None, :], axis=1)
-    return 1 / jnp.maximum(size, jnp.finfo(M.dtype).tiny)
+    none = is_rounding(jnp.sqrt(size))
+    return jnp.where(none, 0, 1 / jnp.where(none, 1, size))
 
 
 def _masses(M: Float[Array, "n n"]) -> Float[Array, " n"]:

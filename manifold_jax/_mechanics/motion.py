@@ -48,7 +48,8 @@ class LagrangianForce(eqx.Module):
 
 # Largest residual of a redundant equation, relative to the size of its terms.
 _LARGEST_RESIDUAL = 0.05
-# Largest rounding of the residual, relative to free accelerations, in units of the last place.
+# Largest rounding of the residual, relative to free accelerations and squares of velocities, in units of the
+# last place.
 _ROUNDING = 1000
 
 
@@ -94,7 +95,7 @@ class EquationsOfMotion:
             residual = multiply(self.C, accelerations) + bias
             valid &= self.factorization.solves(residual, size2)  # pyright: ignore[reportAttributeAccessIssue]
         elif self.redundant:
-            valid &= _agree(self.C, accelerations, free, bias)
+            valid &= _agree(self.C, accelerations, free, self.here.w, bias)
         return _defined(accelerations, multipliers, valid)
 
     def constrained(self, b: Float[Array, " m"]) -> Float[Array, " n"]:
@@ -122,17 +123,23 @@ def _agree(
     C: Float[Array, "m n"],
     a: Float[Array, " n"],
     free: Float[Array, " n"],
+    w: Float[Array, " n"],
     bias: Float[Array, " m"],
 ) -> BoolScalar:
     """Whether `C a = -bias`, up to the inconsistency that redundant equations have off the manifold, and to the
-    rounding of the `free` accelerations, which is all that is left at rest in an equilibrium. If not, an
-    independent equation was taken for a dependent one."""
-    C, a, free, bias = jax.lax.stop_gradient((C, a, free, bias))
+    rounding of the `free` accelerations, which is all that is left at rest in an equilibrium, and of the bias, a
+    square of the velocities `w`. If not, an independent equation was taken for a dependent one."""
+    C, a, free, w, bias = jax.lax.stop_gradient((C, a, free, w, bias))
     sizes = jnp.abs(C)
+    rows = jnp.max(sizes, axis=1)
     own = sizes @ jnp.abs(a) + jnp.abs(bias)
     # For rows without motion, e.g. across the plane of a planar mechanism in space.
-    largest = jnp.max(sizes, axis=1) * jnp.max(jnp.abs(a)) + jnp.max(jnp.abs(bias))
-    rounding = _ROUNDING * jnp.finfo(a.dtype).eps * jnp.max(sizes, axis=1) * jnp.max(jnp.abs(free))
+    largest = rows * jnp.max(jnp.abs(a)) + jnp.max(jnp.abs(bias))
+    # The terms of a row that is zero, which cancelled, were as large as other rows, or about 1.
+    terms = jnp.where(rows > 0, rows, jnp.max(rows))
+    terms = jnp.where(terms > 0, terms, 1)
+    motion = jnp.max(jnp.abs(free)) + jnp.max(w * w)
+    rounding = _ROUNDING * jnp.finfo(a.dtype).eps * terms * motion
     most = _LARGEST_RESIDUAL * (own + 0.02 * largest) + rounding
     return jnp.all(jnp.abs(C @ a + bias) <= most)
 

@@ -23,9 +23,9 @@ from .reading import Energy, JointForce, Times
 from .rotors import names_of
 from .spanning_tree import find_spanning_tree, SpanningTree
 from .start import CLOSED
-from .system import ConstantAssembly
+from .system import ConstantAssembly, only_in_joint_coordinates
 from .tree_checks import check_couplings, check_cycles, check_masses
-from .tree_independent import check_light_motions, find_independent_loops
+from .tree_independent import check_dependent_loops, check_light_motions, find_independent_loops
 from .tree_motion import TreeMotion
 from .tree_readings import coordinates_of, poses_of
 from .tree_system import LoopEquations, motion_of, TreeForces, TreeMass
@@ -66,7 +66,8 @@ class JointCoordinates(eqx.Module):
         unit quaternion, by which the second body is turned from where it is drawn, in the frame of the
         first. Bodies that no joints but rods tie to the ground have the coordinates of a `Pose`.
     - `terms`, `constraint`: the vector field on `(q, v)` with `v = dq/dt`, and the manifold; `None` if all joints are
-        part of the tree, which is then solved by any solver alone.
+        part of the tree, or the others of an assembly `without_dependent_equations` follow from it (a door on two
+        hinges), which is then solved by any solver alone.
     - `system`: both as a [`MechanicalSystem`][manifold_jax.MechanicalSystem], of a tree one with no equations, for
         [`equilibrium`][manifold_jax.equilibrium] and [`rattle`][manifold_jax.rattle].
 
@@ -137,7 +138,8 @@ class JointCoordinates(eqx.Module):
         rest. Poses do not tell whole turns: angles are from `-pi` to `pi`, those of a hinge with stops as near as
         possible to the middle of these. Add multiples of `2 pi` to others.
 
-        **Raises** `ValueError` if the state does not satisfy the joints of the tree.
+        **Raises** `ValueError` if the state does not satisfy the joints of the tree, and where equations of loops
+        depend on each other but the assembly is neither `redundant` nor one of `without_dependent_equations`.
         """
         y = self.assembly.state() if y is None else y
         found = _between_stops(self._motion, _stops_of_hinges(self.assembly), y)
@@ -168,6 +170,11 @@ class JointCoordinates(eqx.Module):
             times = jnp.broadcast_to(floating(t), y[0].shape[:1])
             return jax.vmap(lambda t, y: self.joint_forces(t, y, args))(times, y)
         known = self._motion.coordinates.known(y[0])
+        if listed := only_in_joint_coordinates(self.assembly, known):
+            raise ValueError(
+                f"`joint_forces`: forces in joints are found from the poses of bodies, and not yet with {listed}. Leave these out, "
+                "or give bodies mass, for an assembly whose forces are wanted."
+            )
         return find_joint_forces(self.assembly, t, self.poses(y), args, known)
 
     @property
@@ -176,6 +183,8 @@ class JointCoordinates(eqx.Module):
 
     @property
     def _has_constraints(self) -> bool:
+        if self.independent is not None:
+            return bool(self.independent)
         has_loops = any(self.tree.loops) or bool(self.assembly.couplings.names)
         return has_loops or self._motion.coordinates.has("quaternion")
 
@@ -196,6 +205,8 @@ class JointCoordinates(eqx.Module):
                     f"{gap.max():.3g}). Make a state by `assembly.state(..., assemble=True)`."
                 )
         check_couplings(self.assembly.couplings, self._motion.coordinates, *found)
+        if not (self.assembly.redundant or self.assembly.independent is not None):
+            check_dependent_loops(self.assembly, self._motion, found[0])
 
     def _find_independent(self) -> tuple[int, ...] | None:
         if not all(map(is_concrete, jtu.tree_leaves(self.assembly))):

@@ -131,7 +131,7 @@ class LoopClosure:
         self._check_positions(x, advice)
         _, driven, J = self.known(x)
         rate = driven + J @ w
-        w[self.free_w] -= np.linalg.lstsq(J[:, self.free_w], rate, rcond=_dependent(J))[0]
+        w[self.free_w] -= np.linalg.lstsq(J[:, self.free_w], rate, rcond=dependence_of(J.dtype))[0]
         return self.unravel(jnp.asarray(x)), self.unravel(jnp.asarray(w))
 
     def closed(self, x: np.ndarray) -> np.ndarray:
@@ -141,7 +141,9 @@ class LoopClosure:
             phi, _, J = self.known(x)
             if np.abs(phi).max(initial=0) < 10 * np.finfo(x.dtype).eps:
                 break
-            x[self.free_x] -= np.linalg.lstsq(J[:, self.free_x], phi, rcond=_dependent(J))[0]
+            x[self.free_x] -= np.linalg.lstsq(J[:, self.free_x], phi, rcond=dependence_of(J.dtype))[
+                0
+            ]
         return x
 
     def check(self, y: tuple[Pose, Pose]) -> None:
@@ -180,18 +182,7 @@ class LoopClosure:
     def _check_rank(self, J: np.ndarray) -> None:
         solved = self.assembly.independent
         rows = np.arange(J.shape[0]) if solved is None else np.array(solved.rows)
-        number, dependent = dependent_equations(J[rows])
-        if number == 0:
-            return
-        among = np.zeros(J.shape[0], bool)
-        among[rows[dependent]] = True
-        names = [name for name, rows in self.named_rows if among[rows].any()]
-        raise ValueError(
-            f"{number} of the {J.shape[0]} equations of the joints depend on others in this pose, among those of "
-            f"{', '.join(names[:10])}{', ...' if len(names) > 10 else ''}. If they do so in every pose (closed loops), "
-            "write `Assembly(..., redundant=True)`, or take `assembly.without_dependent_equations()`; if in this one alone, "
-            "start beside it."
-        )
+        refuse_dependent(J, rows, self.named_rows)
 
     def assembled_when_run(self) -> tuple[Pose, Pose]:
         """Take the same steps in a traced program, with derivatives through all of them. At run time an
@@ -234,8 +225,26 @@ def dependent_equations(J: np.ndarray) -> tuple[int, np.ndarray]:
     """Return how many of the rows depend on others, and which rows take part."""
     J = J / np.maximum(np.linalg.norm(J, axis=1, keepdims=True), np.finfo(J.dtype).tiny)
     left, sizes, _ = np.linalg.svd(J, full_matrices=True)
-    rank = int(np.sum(sizes > _dependent(J) * sizes.max(initial=1)))
+    rank = int(np.sum(sizes > dependence_of(J.dtype) * sizes.max(initial=1)))
     return J.shape[0] - rank, np.abs(left[:, rank:]).max(axis=1, initial=0) > 1e-6
+
+
+def refuse_dependent(
+    J: np.ndarray, solved: np.ndarray, named_rows: list[tuple[str, np.ndarray]]
+) -> None:
+    """Raise if some of the rows that are `solved` depend on others, with the names of joints that take part."""
+    number, dependent = dependent_equations(J[solved])
+    if number == 0:
+        return
+    among = np.zeros(J.shape[0], bool)
+    among[solved[dependent]] = True
+    names = [name for name, rows in named_rows if among[rows].any()]
+    raise ValueError(
+        f"{number} of the {J.shape[0]} equations of the joints depend on others in this pose, among those of "
+        f"{', '.join(names[:10])}{', ...' if len(names) > 10 else ''}. If they do so in every pose (closed loops), "
+        "write `Assembly(..., redundant=True)`, or take `assembly.without_dependent_equations()`; if in this one alone, "
+        "start beside it."
+    )
 
 
 def _least_norm(J: Float[Array, "m n"], b: Float[Array, " m"]) -> Float[Array, " n"]:
@@ -247,5 +256,6 @@ def _closed(x: np.ndarray) -> float:
     return max(CLOSED, ROUNDING * float(np.finfo(x.dtype).eps) * largest)
 
 
-def _dependent(J: np.ndarray) -> float:
-    return max(DEPENDENT, 100 * float(np.finfo(J.dtype).eps))
+def dependence_of(dtype: Any) -> float:
+    """Return the fraction of the largest singular value below which others belong to dependent equations."""
+    return max(DEPENDENT, 100 * float(jnp.finfo(dtype).eps))

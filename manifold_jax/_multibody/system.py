@@ -28,9 +28,9 @@ class ConstantAssembly(eqx.Module):
         return self.assembly
 
 
-def check_for_poses(assembly: Any, known: KnownCoordinates = NONE_KNOWN) -> None:
-    """Raise for what is no part of a system in the poses of bodies: its mass matrix has a nonsingular block for
-    each, and angles that are read from them, not known, end at `pi`."""
+def only_in_joint_coordinates(assembly: Any, known: KnownCoordinates = NONE_KNOWN) -> str:
+    """Return a list of what is no part of a system in the poses of bodies: its mass matrix has a nonsingular block
+    for each, and angles that are read from them, not known, end at `pi`."""
     mass = assembly.bodies.mass
     massless = np.flatnonzero(np.asarray(mass) == 0) if is_concrete(mass) else ()
     found = {
@@ -46,7 +46,12 @@ def check_for_poses(assembly: Any, known: KnownCoordinates = NONE_KNOWN) -> None
         ),
         "bodies without mass,": tuple(assembly.bodies.names[i] for i in massless),
     }
-    if listed := "; ".join(f"{what} {list(own)[:12]}" for what, own in found.items() if own):
+    return "; ".join(f"{what} {list(own)[:12]}" for what, own in found.items() if own)
+
+
+def check_for_poses(assembly: Any, known: KnownCoordinates = NONE_KNOWN) -> None:
+    """Raise for what is no part of a system in the poses of bodies."""
+    if listed := only_in_joint_coordinates(assembly, known):
         raise ValueError(
             f"The assembly has what is supported in the coordinates of joints alone: {listed}. Solve "
             "`mj.multibody.JointCoordinates(assembly)` instead of the assembly."
@@ -84,7 +89,7 @@ class JointEquations(AbstractPositions):
             equations = (*equations, (jnp.sum(q.orientation**2, axis=1) - 1) / 2)
         if self.rows is None:
             return equations
-        return jnp.concatenate([part.reshape(-1) for part in equations])[np.array(self.rows)]
+        return jnp.concatenate([part.reshape(-1) for part in equations])[np.array(self.rows, int)]
 
     def jacobian(self, t: RealScalarLike, q: Pose, args: Args) -> Float[Array, "m n"]:
         rows = jacobian(self.source(args).joints_at(t, args), q)
@@ -93,7 +98,7 @@ class JointEquations(AbstractPositions):
             norms = own[:, :, None] * jnp.pad(p, ((0, 0), (3, 0)))[:, None, :]
             rows = jnp.concatenate([rows, norms])
         rows = rows.reshape(rows.shape[0], -1)
-        return rows if self.rows is None else rows[np.array(self.rows)]
+        return rows if self.rows is None else rows[np.array(self.rows, int)]
 
 
 class _Forces(eqx.Module):

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 from .assembly import Assembly
 from .couplings import Couplings
 from .rotors import names_of
-from .start import DEPENDENT
+from .start import dependence_of, DEPENDENT, refuse_dependent
 from .system import ConstantAssembly
 from .tree_checks import rank_of
 from .tree_motion import TreeMotion
@@ -22,13 +22,8 @@ def find_independent_loops(
 ) -> tuple[int, ...] | None:
     """Return the numbers of as many equations of loops as are independent in the drawing, where the coordinates are
     `q`; `None` for all. That they are so elsewhere was found by `without_dependent_equations`."""
-    groups = assembly.joints
-    passive = tuple(
-        () if group.motions is not None else own
-        for group, own in zip(groups, motion.tree.loops, strict=True)
-    )
-    loops = Loops.of(groups, motion.tree._replace(loops=passive))
-    J = np.asarray(_derivatives(motion, loops, assembly.couplings, q)[1])
+    groups, loops = assembly.joints, _passive_loops(assembly, motion)
+    J = np.concatenate(_derivatives(motion, loops, assembly.couplings, q)[1])
     # Links without mass count as if they had some: equations that differ in their motions alone are independent.
     with_masses = assembly.bodies.with_masses()
     weighed = eqx.tree_at(lambda assembly: assembly.bodies, assembly, with_masses)
@@ -38,11 +33,12 @@ def find_independent_loops(
     weighted = J @ (modes[:, has_mass] / np.sqrt(sizes[has_mass]))
     lengths = np.linalg.norm(weighted, axis=1, keepdims=True)
     # Equations that hold whatever the coordinates are, such as those across the plane of a linkage, count as zero.
-    has_size = lengths > DEPENDENT * lengths.max(initial=0)
+    dependence = dependence_of(J.dtype)
+    has_size = lengths > dependence * lengths.max(initial=0)
     weighted = np.where(has_size, weighted / np.where(has_size, lengths, 1), 0)
     _, triangle, order = scipy.linalg.qr(weighted.T, mode="economic", pivoting=True)  # pyright: ignore[reportAssignmentType]
     pivots = np.abs(np.diagonal(triangle))
-    number = int(np.sum(pivots > DEPENDENT * pivots.max(initial=1e-300)))
+    number = int(np.sum(pivots > dependence * pivots.max(initial=0)))
     _check_couplings_with_loops(assembly.couplings.names, weighted, number)
     if number == J.shape[0]:
         return None
@@ -55,6 +51,26 @@ def find_independent_loops(
     rest = J.shape[0] + drives + np.arange(norms)
     rows = [of_loops, joints + np.arange(drives), of_couplings, rest]
     return tuple(np.concatenate(rows).tolist())
+
+
+def check_dependent_loops(assembly: Assembly, motion: TreeMotion, q: Float[Array, " n"]) -> None:
+    """Refuse loops and couplings whose equations depend on each other where the coordinates are `q`."""
+    loops = _passive_loops(assembly, motion)
+    parts = _derivatives(motion, loops, assembly.couplings, q)[1]
+    groups = *(group.attachment.names for group in loops.groups), assembly.couplings.names
+    numbers, named = np.arange(sum(map(len, parts))), []
+    for names, own in zip(groups, np.split(numbers, np.cumsum([*map(len, parts)])), strict=False):
+        named += list(zip(names, own.reshape(len(names), -1), strict=True)) if names else []
+    refuse_dependent(np.concatenate(parts), numbers, named)
+
+
+def _passive_loops(assembly: Assembly, motion: TreeMotion) -> Loops:
+    """Return the loops without drives, which are between them and the couplings."""
+    passive = tuple(
+        () if group.motions is not None else own
+        for group, own in zip(assembly.joints, motion.tree.loops, strict=True)
+    )
+    return Loops.of(assembly.joints, motion.tree._replace(loops=passive))
 
 
 def _check_couplings_with_loops(names: tuple[str, ...], rows: np.ndarray, rank: int) -> None:
@@ -73,7 +89,8 @@ def check_light_motions(assembly: Assembly, motion: TreeMotion) -> None:
     loops, n = Loops.of(assembly.joints, motion.tree), motion.coordinates.size
     # Not in the drawing, where axes may coincide by chance.
     q = jnp.sin(1.0 + jnp.arange(n, dtype=assembly.bodies.mass.dtype))
-    bodies, equations = map(np.asarray, _derivatives(motion, loops, assembly.couplings, q))
+    bodies, parts = _derivatives(motion, loops, assembly.couplings, q)
+    bodies, equations = np.asarray(bodies), np.concatenate(parts)
     heavy = bodies[np.asarray(assembly.bodies.mass) > 0]
     quaternions = motion.coordinates.quaternions()
     norms = np.zeros((len(quaternions), n))
@@ -96,10 +113,10 @@ def check_light_motions(assembly: Assembly, motion: TreeMotion) -> None:
 @eqx.filter_jit
 def _derivatives(
     motion: TreeMotion, loops: Loops, couplings: Couplings, q: Float[Array, " n"]
-) -> tuple[Float[Array, "b n 6"], Float[Array, "m n"]]:
+) -> tuple[Float[Array, "b n 6"], tuple[Float[Array, "_ n"], ...]]:
     """Return those of velocities and angular velocities of bodies, and of the equations of loops and couplings, by
-    the rates of `q`."""
+    the rates of `q`; those of each group of joints, and last of couplings."""
     at = motion.place(q)
     bodies = jnp.concatenate(motion.jacobians(at), axis=2)
     rows = loops.jacobian(at, bodies)
-    return bodies, jnp.concatenate([*rows, couplings.jacobian(motion.coordinates, q)])
+    return bodies, (*rows, couplings.jacobian(motion.coordinates, q))

@@ -19,6 +19,7 @@ from .joint_groups import bodies_of, JointGroup, residuals_of
 from .loads import add
 from .rotations import turn
 from .spanning_tree import SpanningTree
+from .start import dependence_of
 from .tree_motion import TreeMotion, TreePlacement
 from .tree_readings import poses_of
 
@@ -94,7 +95,7 @@ class LoopEquations(AbstractPositionsWithBias):
         p = q[motion.coordinates.quaternions()]
         parts.append((jnp.sum(p * p, axis=1) - 1) / 2)
         found = jnp.concatenate(parts)
-        return found if self.rows is None else found[np.array(self.rows)]
+        return found if self.rows is None else found[np.array(self.rows, int)]
 
     def jacobian(self, t: RealScalarLike, q: Float[Array, " n"], args: Args) -> Float[Array, "m n"]:
         assembly = self.source(args)
@@ -106,7 +107,7 @@ class LoopEquations(AbstractPositionsWithBias):
         norms = norms.at[np.arange(numbers.shape[0])[:, None], numbers].set(q[numbers])
         coupled = assembly.couplings.jacobian(motion.coordinates, q)
         rows = jnp.concatenate([*loops.jacobian(at, J), coupled, norms])
-        return rows if self.rows is None else rows[np.array(self.rows)]
+        return rows if self.rows is None else rows[np.array(self.rows, int)]
 
     def bias(
         self, t: RealScalarLike, q: Float[Array, " n"], v: Float[Array, " n"], args: Args
@@ -130,7 +131,7 @@ class LoopEquations(AbstractPositionsWithBias):
         norms = jnp.sum(v[numbers] ** 2, axis=1)
         coupled = assembly.couplings.bias(motion.coordinates, q, v)
         rows = jnp.concatenate([*(part.reshape(-1) for part in found), coupled, norms])
-        return rows if self.rows is None else rows[np.array(self.rows)]
+        return rows if self.rows is None else rows[np.array(self.rows, int)]
 
 
 class Loops(NamedTuple):
@@ -168,7 +169,8 @@ class Loops(NamedTuple):
         self, at: TreePlacement, J: Float[Array, "b n 6"]
     ) -> tuple[Float[Array, "_ n"], ...]:
         """Return the derivatives by `q`: those by motions of the two bodies of each joint, times the
-        derivatives `J` of these."""
+        derivatives `J` of these. Zero, not rounding, for equations that joints of the tree satisfy by themselves,
+        such as those across the plane of a linkage."""
         if not self.groups:
             return ()
         placed, index = self._placed(at), bodies_of(self.groups)
@@ -186,12 +188,27 @@ class Loops(NamedTuple):
         slopes = jax.vmap(along)(jnp.eye(12, dtype=J.dtype).reshape(12, 2, 6))
         motions = jnp.pad(J, ((0, 1), (0, 0), (0, 0)))[index]  # (2, K, n, 6)
         motions = jnp.moveaxis(motions, 3, 1).reshape(12, *motions.shape[1:3])
+        sizes = self._sizes(at, motions)
         found, start = [], 0
         for slope in slopes:
-            own = motions[:, start : (start := start + slope.shape[1])]
-            rows = jnp.sum(slope[:, :, :, None] * own[:, :, None, :], axis=0)
+            part = slice(start, start := start + slope.shape[1])
+            rows = jnp.sum(slope[:, :, :, None] * motions[:, part, None, :], axis=0)
+            terms = jnp.sum(jnp.abs(slope) * sizes[:, part, None], axis=0)
+            holds = jnp.max(jnp.abs(rows), axis=2) <= dependence_of(rows.dtype) * terms
+            rows = jnp.where(holds[:, :, None], 0, rows)
             found.append(rows.reshape(-1, rows.shape[2]))
         return tuple(found)
+
+    def _sizes(self, at: TreePlacement, motions: Float[Array, "12 k n"]) -> Float[Array, "12 k"]:
+        """Return how large the terms are that add up to motions of the bodies of each joint: a point on the axis of a
+        hinge is moved by rounding, of what a point as far away beside it is moved."""
+        largest = jnp.max(jnp.abs(motions), axis=2).reshape(2, 2, 3, -1)
+        linear, angular = (jnp.max(part, axis=1) for part in jnp.moveaxis(largest, 1, 0))
+        points = jnp.concatenate([at.origin[:-1], at.point])
+        points_in_bodies = jnp.concatenate([g.attachment.points for g in self.groups], axis=1)
+        reach = jnp.max(jnp.ptp(points, axis=0)) + jnp.max(jnp.abs(points_in_bodies), axis=2)
+        both = jnp.stack([linear + reach * angular, angular], axis=1)
+        return jnp.repeat(both.reshape(4, -1), 3, axis=0)
 
 
 def _part(group: JointGroup, own: np.ndarray) -> JointGroup:
