@@ -10,7 +10,7 @@ import manifold_jax as mj
 
 
 mb = mj.multibody
-AXES = [(0.0, 0.0, 1.0), (1.0, 2.0, 3.0), (0.0, 0.3, 1.0)]
+AXES = [(0.0, 0.0, 1.0), (1.0, 2.0, 3.0)]
 
 
 def door(axis, redundant=False):

@@ -205,7 +205,8 @@ class JointCoordinates(eqx.Module):
                     f"{gap.max():.3g}). Make a state by `assembly.state(..., assemble=True)`."
                 )
         check_couplings(self.assembly.couplings, self._motion.coordinates, *found)
-        if not (self.assembly.redundant or self.assembly.independent is not None):
+        checked = self.assembly.redundant or self.assembly.independent is not None
+        if self._has_constraints and not checked:
             check_dependent_loops(self.assembly, self._motion, found[0])
 
     def _find_independent(self) -> tuple[int, ...] | None:

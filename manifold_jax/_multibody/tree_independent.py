@@ -118,5 +118,5 @@ def _derivatives(
     the rates of `q`; those of each group of joints, and last of couplings."""
     at = motion.place(q)
     bodies = jnp.concatenate(motion.jacobians(at), axis=2)
-    rows = loops.jacobian(at, bodies)
+    rows = loops.jacobian(at, bodies, some_hold=True)
     return bodies, (*rows, couplings.jacobian(motion.coordinates, q))

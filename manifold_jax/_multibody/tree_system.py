@@ -106,7 +106,9 @@ class LoopEquations(AbstractPositionsWithBias):
         norms = jnp.zeros((numbers.shape[0], q.size), q.dtype)
         norms = norms.at[np.arange(numbers.shape[0])[:, None], numbers].set(q[numbers])
         coupled = assembly.couplings.jacobian(motion.coordinates, q)
-        rows = jnp.concatenate([*loops.jacobian(at, J), coupled, norms])
+        # Those that hold identically were found before if the others are numbered.
+        closed = loops.jacobian(at, J, some_hold=assembly.redundant)
+        rows = jnp.concatenate([*closed, coupled, norms])
         return rows if self.rows is None else rows[np.array(self.rows, int)]
 
     def bias(
@@ -166,11 +168,11 @@ class Loops(NamedTuple):
         return residuals_of(self.groups, Placed(origin, R + since * rate + half * bend))
 
     def jacobian(
-        self, at: TreePlacement, J: Float[Array, "b n 6"]
+        self, at: TreePlacement, J: Float[Array, "b n 6"], *, some_hold: bool
     ) -> tuple[Float[Array, "_ n"], ...]:
         """Return the derivatives by `q`: those by motions of the two bodies of each joint, times the
-        derivatives `J` of these. Zero, not rounding, for equations that joints of the tree satisfy by themselves,
-        such as those across the plane of a linkage."""
+        derivatives `J` of these. If joints of the tree may satisfy some equations by themselves, such as those
+        across the plane of a linkage, zero for these, not rounding."""
         if not self.groups:
             return ()
         placed, index = self._placed(at), bodies_of(self.groups)
@@ -188,14 +190,15 @@ class Loops(NamedTuple):
         slopes = jax.vmap(along)(jnp.eye(12, dtype=J.dtype).reshape(12, 2, 6))
         motions = jnp.pad(J, ((0, 1), (0, 0), (0, 0)))[index]  # (2, K, n, 6)
         motions = jnp.moveaxis(motions, 3, 1).reshape(12, *motions.shape[1:3])
-        sizes = self._sizes(at, motions)
+        sizes = self._sizes(at, motions) if some_hold else None
         found, start = [], 0
         for slope in slopes:
             part = slice(start, start := start + slope.shape[1])
             rows = jnp.sum(slope[:, :, :, None] * motions[:, part, None, :], axis=0)
-            terms = jnp.sum(jnp.abs(slope) * sizes[:, part, None], axis=0)
-            holds = jnp.max(jnp.abs(rows), axis=2) <= dependence_of(rows.dtype) * terms
-            rows = jnp.where(holds[:, :, None], 0, rows)
+            if sizes is not None:
+                terms = jnp.sum(jnp.abs(slope) * sizes[:, part, None], axis=0)
+                holds = jnp.max(jnp.abs(rows), axis=2) <= dependence_of(rows.dtype) * terms
+                rows = jnp.where(holds[:, :, None], 0, rows)
             found.append(rows.reshape(-1, rows.shape[2]))
         return tuple(found)
 
