@@ -482,6 +482,16 @@ def descend(q, x0, t1=1e6):
 SYMMETRIC = np.array([[2.0, 0.3, -0.4], [0.3, 5.0, 0.7], [-0.4, 0.7, 3.0]])
 
 
+def test_a_start_that_cannot_be_left():
+    """It is what was reached: the equations depend on each other there."""
+    twice = mj.Constraint(lambda t, x, args: jnp.stack([x[0] - 2, 2 * x[0] - 4]))
+    start = jnp.array([2.0, 1.0])
+    minimum = mj.gradient_flow(lambda x, args: x @ x, twice, start, throw=False)
+    assert minimum.result != SUCCESS
+    np.testing.assert_array_equal(minimum.x, start)
+    assert not minimum.is_minimum
+
+
 def test_rayleigh_quotient():
     """The least eigenvalue, as the multiplier; the gap to the next one is the curvature."""
     values, vectors = np.linalg.eigh(SYMMETRIC)

@@ -67,6 +67,12 @@ def test_what_is_lost_is_named_and_made_again(name, damage, what, whole, copy):
     assert_same_files(whole, copy)
 
 
+def test_trajectories_of_the_last_chunk(copy):
+    lose(copy / "ys/0/c/4/0/0")
+    with pytest.raises(ValueError, match=rf"\(trajectories from 256 to {SIZE - 1}\)"):
+        mj.open_ensemble(copy)
+
+
 def test_a_chunk_of_which_everything_is_lost(whole, copy):
     """Trajectories that are not there are no failures."""
     for file in list(copy.rglob("c/1")):

@@ -179,7 +179,7 @@ def gradient_flow(
     result = RESULTS.where(unfinished, RESULTS.nonlinear_max_steps_reached, result)  # pyright: ignore[reportArgumentType]
     result = RESULTS.where(usable, result, nonlinear_failure())
     reach = jnp.where(usable & arrived, tolerance**0.5, 0.0)
-    minimum = _describe(lagrangian, sol, unravel, reach, size, result)
+    minimum = _describe(lagrangian, sol, start, unravel, reach, size, result)
     faults = jnp.append(faults, unfinished)
     return raise_if_failed(minimum, faults, _MESSAGES) if throw else minimum
 
@@ -234,12 +234,15 @@ def _descend(
 def _describe(
     lagrangian: Lagrangian,
     sol: dfx.Solution,
+    start: Float[Array, " n"],
     unravel: Callable,
     reach: FloatScalar,
     size: FloatScalar,
     result: RESULTS,
 ) -> ConstrainedMinimum:
-    x, multipliers, curvature, is_minimum = stationary_point(lagrangian, sol.ys[-1], reach, size)  # pyright: ignore[reportOptionalSubscript]
+    reached = sol.ys[-1]  # pyright: ignore[reportOptionalSubscript]
+    reached = jnp.where(jnp.all(jnp.isfinite(reached)), reached, start)
+    x, multipliers, curvature, is_minimum = stationary_point(lagrangian, reached, reach, size)
     return ConstrainedMinimum(
         x=unravel(x),
         multipliers=multipliers,

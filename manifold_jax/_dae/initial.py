@@ -40,9 +40,9 @@ def consistent_state(
     z, info, nonsingular = _find_consistent_state(system, t, guess, args)
     if throw:
         leading = system.leading_equations(t, system.split(z)[0], args)
-        _explain(leading, guess, info, nonsingular)
         near = info.residual <= NewtonProjection().tolerance_for(z.dtype)
-        cause = jnp.where(info.full_rank, jnp.where(near, 2, 1), 0)
+        _explain(leading, guess, info, nonsingular)
+        cause = jnp.where(info.full_rank, jnp.where(near, 2, 1), jnp.where(near, 0, 3))
         cause = jnp.where(info.success, 0, cause)
         z = _raise_unless(info.success, z, cause, tuple(_messages(guess, leading)))
     return z, info
@@ -134,6 +134,9 @@ def _messages(guess: Guess, leading: HighestDerivatives) -> list[str]:
         f"check that they can hold at the same time.{zero}",
         "The equations of `F` do not determine all derivatives at the start: some depend on the others there "
         f"(redundant), or it is a singular configuration.{zero}",
+        f"No state near `x_guess` satisfies the equations of `F` and their derivatives{held}: where the search for one ended, "
+        f"they depend on each other.{advice} Check that they can hold at the same time, remove equations that follow from "
+        f"others, or start elsewhere.{zero}{other_form}",
     ]
 
 
@@ -168,6 +171,9 @@ def _explain(
         return
     if bool(info.success) or (any(guess.fixed) and bool(nonsingular)):
         return
+    if not info.residual <= NewtonProjection().tolerance_for(leading.z.dtype):
+        # Where the iterations ended tells nothing: that is no state.
+        leading = dataclasses.replace(leading, z=guess.z)
     matrix = sp.csr_array(np.asarray(leading.matrix(guess.w)))
     if not np.isfinite(matrix.data).all():
         raise ValueError(

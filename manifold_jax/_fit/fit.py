@@ -134,7 +134,8 @@ def fit(
     **Returns:**
 
     A [`FitResult`][]: `parameters`, `standard_errors` and `covariance` (`s^2 (J^T J)^-1`
-    with the Jacobian `J` of the weighted residuals), with `sigma` given the verdict of a chi-squared
+    with the Jacobian `J` of the weighted residuals and `s = 1` if `sigma` is given, else the estimated noise), with
+    `sigma` given the verdict of a chi-squared
     test (`fits`, `probability`), history, report (`print`) and `plot`.
 
     **Raises:**

@@ -205,7 +205,7 @@ def _opened(
         if stored is None:
             raise FileExistsError(
                 errno.EEXIST,
-                f"`path={str(out)!r}` is not empty, and holds no ensemble to continue.",
+                f"`path={str(out)!r}` is not empty, and holds no ensemble to continue: there is no `zarr.json` of one.",
             )
         check_settings(out, stored.settings, settings)
     clear_partial(out)

@@ -79,12 +79,14 @@ def finished_chunks(group: Any) -> list[int]:
     return sorted(_chunks_there(group.store.root, "result", group["result"]))
 
 
-def in_words(faults: list[Fault], chunk: int) -> str:
+def in_words(faults: list[Fault], chunk: int, size: int) -> str:
+    """Return a list of the faults, with the trajectories of the `size` that chunks of so many hold."""
+
     def words(fault: Fault) -> str:
         if fault.chunk is None:
             return str(fault)
         start = fault.chunk * chunk
-        return f"{fault} (trajectories from {start} to {start + chunk - 1})"
+        return f"{fault} (trajectories from {start} to {min(start + chunk, size) - 1})"
 
     more = f", and {len(faults) - _MOST} files more" if len(faults) > _MOST else ""
     return ", ".join(map(words, faults[:_MOST])) + more

@@ -130,7 +130,7 @@ def open_ensemble(path: str | Path, *, check: bool = True) -> StoredEnsemble:
         raise FileNotFoundError(f"`path={str(path)!r}` has no ensemble of `mj.stream_ensemble`.")
     if check and (faults := stored.faults()):
         raise ValueError(
-            f"`path={str(path)!r}`: {in_words(faults, stored.chunk)}. Call `mj.stream_ensemble` as before with "
+            f"`path={str(path)!r}`: {in_words(faults, stored.chunk, stored.size)}. Call `mj.stream_ensemble` as before with "
             "`resume=True`, which computes them again, or open what is left with `check=False`."
         )
     return stored
