@@ -94,6 +94,9 @@ def main(
     json: Annotated[
         Path | None, typer.Option(help="Write to this file; its other robots are kept")
     ] = None,
+    gradients_alone: Annotated[
+        bool, typer.Option(help="Measure only the gradients of robots in the file")
+    ] = False,
 ) -> None:
     """Compare the robots of the collection."""
     use_double_precision()
@@ -102,11 +105,19 @@ def main(
         if not (folder / name / "robot.urdf").exists():
             console.print(f"{name} is not in {folder}: skipped")
             continue
-        rows.append(measure(folder, name, seconds))
+        if gradients_alone:
+            rows.append(with_gradient(folder, row_of(json, name)))
+        else:
+            rows.append(measure(folder, name, seconds))
         console.print(rows[-1])
         if json is not None:  # after each, as some take minutes
             write(json, dataclasses.asdict(rows[-1]))
     console.print(table(rows))
+
+
+def row_of(json: Path | None, name: str) -> Row:
+    rows = [] if json is None else loads(json.read_text())["rows"]
+    return next(Row(**row) for row in rows if row["robot"] == name)
 
 
 def write(json: Path, row: dict[str, Any]) -> None:
@@ -121,34 +132,46 @@ def measure(folder: Path, name: str, seconds: float) -> Row:
     begin = time.perf_counter()
     robot = mb.read_urdf(urdf, closures=closures)
     reading = time.perf_counter() - begin
-    weight = 9.81 * float(jnp.sum(robot.assembly.bodies.mass))
-    stiffness = weight * SOFTER.get(name, STIFFNESS)
-
-    def sprung(damping: float) -> Any:
-        spring: Any = mb.JointSpring
-        springs = [spring(motor, stiffness, damping=damping) for motor in robot.motors]
-        return mb.read_urdf(urdf, closures=closures, forces=springs).assembly
-
     difference, largest, programs = compare(urdf, closures, robot)
-    rest, forward, softly = soften(urdf, closures, robot, stiffness, seconds)
-    machine = sprung(0.0)
-    swung = swing(machine, seconds)
-    steps = round(2 * gradients.SECONDS * swung["steps"] / seconds)
-    damped = sprung(LESS.get(name, DAMPING) * stiffness)
-    return Row(
+    rest, forward, softly = soften(urdf, closures, robot, stiffness_of(robot, name), seconds)
+    machine = sprung(folder, name, 0.0)
+    row = Row(
         robot=name,
         seconds=seconds,
-        stiffness=stiffness / weight,
+        stiffness=SOFTER.get(name, STIFFNESS),
         **sizes(machine),
         difference=difference,
         largest=largest,
         read_s=reading,
-        **swung,
+        **swing(machine, seconds),
         at_rest=rest,
         evaluation_ms=evaluations(machine, programs | forward),
         softly=softly,
-        gradient=dataclasses.asdict(gradients.measure(damped, steps, name in BY_REVERSE)),
+        gradient={},
     )
+    return with_gradient(folder, row)
+
+
+def with_gradient(folder: Path, row: Row) -> Row:
+    """Return the row with derivatives in twice as many equal steps as the swing took."""
+    steps = round(2 * gradients.SECONDS * row.steps / row.seconds)
+    damped = sprung(folder, row.robot, LESS.get(row.robot, DAMPING))
+    found = gradients.measure(damped, steps, row.robot in BY_REVERSE)
+    return dataclasses.replace(row, gradient=dataclasses.asdict(found))
+
+
+def sprung(folder: Path, name: str, damping: float) -> Any:
+    """Return the mechanism with springs in its motors, and dampers of so many seconds times their stiffness."""
+    urdf, closures = folder / name / "robot.urdf", closures_of(folder, name)
+    robot = mb.read_urdf(urdf, closures=closures)
+    stiffness = stiffness_of(robot, name)
+    spring: Any = mb.JointSpring
+    springs = [spring(motor, stiffness, damping=damping * stiffness) for motor in robot.motors]
+    return mb.read_urdf(urdf, closures=closures, forces=springs).assembly
+
+
+def stiffness_of(robot: Any, name: str) -> float:
+    return 9.81 * float(jnp.sum(robot.assembly.bodies.mass)) * SOFTER.get(name, STIFFNESS)
 
 
 def closures_of(folder: Path, name: str) -> dict[str, Any]:
