@@ -479,6 +479,55 @@ def test_a_known_time_at_which_a_condition_crosses(time):
     assert sol.resets.number == 1
 
 
+@pytest.mark.parametrize("direction", [None, True])
+@pytest.mark.parametrize("known_first", [True, False])
+def test_crossings_close_to_a_known_time(known_first, direction):
+    """Each happens once, closely before or after it; also Boolean ones of the state, which may still be false where
+    a step ends that meets them."""
+    offsets = jnp.array([-1e-7, -1e-10, -1e-13, 0.0, 1e-14, 1e-13, 1e-12, 1e-10, 1e-7])
+    log = lambda k: lambda t, y, args: y.at[1].set(10 * y[1] + k)
+    field = dfx.ODETerm(lambda t, y, args: y * jnp.array([1.0, 0.0]))
+
+    def solve(offset, boolean):
+        at = jnp.exp(0.7) * (1 + offset)
+        above = lambda t, y, args: y[0] >= at if boolean else y[0] - at
+        resets = mj.Reset(above, log(1.0), direction=direction), mj.ResetAt([0.7], log(2.0))
+        return mj.diffeqsolve(
+            field,
+            dfx.Dopri8(),
+            0.0,
+            1.0,
+            0.02,
+            jnp.array([1.0, 0.0]),
+            resets=resets[::-1] if known_first else resets,
+            max_steps=200,
+        )
+
+    for boolean in (False, True):
+        sols = jax.jit(jax.vmap(lambda c, boolean=boolean: solve(c, boolean)))(offsets)
+        digits = sols.ys[:, -1, 1]
+        assert sols.resets.number.tolist() == [2] * len(offsets)
+        assert digits[:2].tolist() == [12, 12]
+        assert digits[-2:].tolist() == [21, 21]
+
+
+def test_zero_without_slope_at_a_known_time():
+    """A condition that only touches zero there happens once."""
+    add = lambda x: lambda t, y, args: y + x
+    touching = mj.Reset(lambda t, y, args: (t - 0.7) ** 2, add(100.0))
+    for resets in (touching, mj.ResetAt([0.7], add(1.0))), (mj.ResetAt([0.7], add(1.0)), touching):
+        sol = mj.diffeqsolve(
+            dfx.ODETerm(lambda t, y, args: jnp.zeros_like(y)),
+            dfx.Dopri8(),
+            0.0,
+            1.0,
+            0.02,
+            jnp.zeros(1),
+            resets=resets,
+        )
+        assert sol.ys[0, 0] == 101
+
+
 def test_an_event_at_the_start():
     """On the surface and moving across it: at once. On its other side: not at all."""
     falling = BALL.at[2].set(0.0).at[3].set(-1.0)

@@ -19,6 +19,7 @@ class History(eqx.Module):
     # Their largest values in the step before the jump, from which follows what is rounding after it. It is
     # kept as long as a condition has not left zero since, and 0 then.
     scale: Float[Array, " resets"]
+    rates: Float[Array, " resets"]  # of change of the conditions just before the last jump
     happened: Int[Array, " resets"]  # how often each has happened
     irregular: IntScalar  # how many had no derivative
     failed: BoolScalar  # whether the state after the last jump could not be used
@@ -27,7 +28,7 @@ class History(eqx.Module):
     def initial(count: int, dtype: Any) -> "History":
         never, zero = jnp.zeros(count, jnp.int32), jnp.zeros((), jnp.int32)
         unknown = jnp.zeros(count, dtype)
-        return History(jnp.asarray(True), unknown, unknown, never, zero, jnp.asarray(False))
+        return History(jnp.asarray(True), *[unknown] * 3, never, zero, jnp.asarray(False))
 
     @property
     def remembers(self) -> Bool[Array, " resets"]:

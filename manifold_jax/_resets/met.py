@@ -19,6 +19,7 @@ class Met(NamedTuple):
     numbers: Float[Array, " 7"]
     sides: Float[Array, " resets"]
     scale: Float[Array, " resets"]
+    rates: Float[Array, " resets"]
     time: FloatScalar
     before: Y
     after: Y
@@ -31,13 +32,14 @@ class Met(NamedTuple):
         flags = found.happens, found.ends_step, exhausted
         numbers = *flags, found.number, jump.success, found.irregular
         numbers = jnp.stack([found.target, *map(real, numbers)])
-        of_conditions = found.sides, found.scale
+        of_conditions = found.sides, found.scale, found.rates
         return Met(numbers, *of_conditions, jump.time, jump.before, jump.after, jump.memory)
 
     @staticmethod
     def without_event(t: FloatScalar, y: Y, memory: Any, history: History) -> "Met":
         numbers = jnp.asarray([0, 0, 0, 0, 0, 1, 0], t.dtype)
-        return Met(numbers, history.sides, jnp.zeros_like(history.scale), t, y, y, memory)
+        unknown = jnp.zeros_like(history.scale)
+        return Met(numbers, history.sides, unknown, unknown, t, y, y, memory)
 
     @property
     def target(self) -> FloatScalar:

@@ -26,6 +26,7 @@ class Found(NamedTuple):
     time: FloatScalar  # of the event, if it is at the end of this step
     sides: Float[Array, " resets"]  # of the conditions just before the jump, as in [`History`][]
     scale: Float[Array, " resets"]
+    rates: Float[Array, " resets"]
 
 
 class EventSearch(NamedTuple):
@@ -57,11 +58,13 @@ class EventSearch(NamedTuple):
         sensitivity = Sensitivity.of(self.values, self.is_boolean, step)
         noise, rate = sensitivity.noise, sensitivity.rate
         small = jnp.maximum(4 * noise, 1e3 * jnp.finfo(noise.dtype).eps * history.scale)
-        before, start, on_surface = self._start(samples, rate, history, small)
+        before, start, on_surface = self._start(step, samples, rate, history, small)
         # A jump changed the sign, or the state leaves the surface on which it began: at once.
         leaves = (before != 0) & (start != 0) & self._crosses(before, start)
         first = _first_sign(samples.inside, small)
         rests = on_surface & (start == 0) & self._crosses(-first, first)
+        # One that touched zero goes back to where it came from.
+        rests &= ~(jnp.isnan(history.sides) & (jnp.sign(history.rates) == -first))
         at_once = jnp.where(self.is_known, self.known_times <= step.t0, leaves | rests)
         largest = jnp.max(jnp.abs(samples.inside), axis=0)
         stays = on_surface & (largest <= small)  # in a step so short that its values are rounding
@@ -75,7 +78,7 @@ class EventSearch(NamedTuple):
         roots = jnp.where(self.is_known, self.known_times, roots)
         roots = jnp.where(at_once, step.t0, roots)
         is_far = (roots > step.t1 + BEYOND * step.length) & ~at_once
-        rounding = jnp.finfo(step.t1.dtype).eps * jnp.maximum(jnp.abs(step.t0), jnp.abs(step.t1))
+        rounding = _rounding(step)
         at_end = roots >= self.end - 200 * rounding  # of the solve, where nothing happens any more
         roots = jnp.where(self.ignored | at_end | is_far, jnp.inf, roots)
         tolerance = self._same_time(step, samples, noise, rounding)
@@ -89,7 +92,12 @@ class EventSearch(NamedTuple):
         # What jumps have caused already, or is at the same time, stays so until its own jump.
         infinite = lambda sign: jnp.where(sign == 0, 0, sign * jnp.inf)
         waiting = jnp.where(leaves, infinite(before), infinite(start))
-        sides = jnp.where(stays, infinite(start), samples.end)
+        same = self._was_true(history) | (jnp.isnan(history.sides) & (start == 0))
+        waiting = jnp.where(same, history.sides, waiting)
+        # One that is zero to rounding there comes from where it was before.
+        is_zero = jnp.abs(samples.end) <= small
+        sides = jnp.where(is_zero, infinite(jnp.sign(samples.before_end)), samples.end)
+        sides = jnp.where(stays, infinite(start), sides)
         sides = jnp.where(near, infinite(signs[place, jnp.arange(place.size)]), sides)
         sides = jnp.where(step.is_negative, waiting, sides)
         # What a condition is at its event is zero, whatever is left of it there.
@@ -97,8 +105,10 @@ class EventSearch(NamedTuple):
         largest = jnp.where(near, jnp.maximum(largest, left_over), largest)
         kept = jnp.where(step.is_negative | stays, history.scale, 0)
         scale = jnp.maximum(largest, kept)
+        rates = (samples.end - samples.before_end) * self.parts / step.length
+        rates = jnp.where(step.is_negative | stays, history.rates, rates)
         found = self._chosen(step, roots, near, at_once, irregular, sides)
-        return found._replace(scale=jnp.where(found.ends_step | stays, scale, 0))
+        return found._replace(scale=jnp.where(found.ends_step | stays, scale, 0), rates=rates)
 
     def _crosses(self, before: Array, after: Array) -> Array:
         up, down = (before < 0) & (after >= 0), (before > 0) & (after <= 0)
@@ -106,20 +116,37 @@ class EventSearch(NamedTuple):
         return (up & (directions >= 0)) | (down & (directions <= 0))
 
     def _start(
-        self, samples: SampledConditions, rate: Array, history: History, small: Array
+        self,
+        step: SearchedStep,
+        samples: SampledConditions,
+        rate: Array,
+        history: History,
+        small: Array,
     ) -> tuple[Array, ...]:
         """Return the signs just before and just after the start of the step, and which conditions are
         zero there up to rounding; the sign of these is that of their rate of change."""
         largest = jnp.max(jnp.abs(samples.inside), axis=0)
-        is_zero = lambda v: jnp.abs(v) <= jnp.maximum(small, 1e-6 * largest)
+        caused = jnp.isnan(history.sides)
+        # Two bodies in contact touch up to the error of the solve. What was moving is where its value says.
+        rested = jnp.abs(history.rates) <= 1e-3 * jnp.abs(rate)
+        small = jnp.maximum(small, jnp.where(caused | rested, 1e-6 * largest, 0))
+        is_zero = lambda v: jnp.abs(v) <= small
         on_surface = history.remembers & is_zero(samples.values[0])
         on_surface &= ~self.is_boolean & ~self.is_known
-        start = jnp.sign(jnp.where(on_surface, rate, samples.values[0]))
+        # A Boolean condition may still be false where its event was taken to be.
+        late = 32 * _rounding(step) + 1e-10 * jnp.abs(step.length)
+        soon = self.values(step.t0 + late, step.path(late / step.length))
+        first = jnp.where(self._was_true(history), soon, samples.values[0])
+        start = jnp.sign(jnp.where(on_surface, rate, first))
         # One that was zero before the jump as well is taken to have been on the side it can leave.
         touching = jnp.where(on_surface, -self.directions, 0)
         before = jnp.where(is_zero(history.sides), touching, jnp.sign(history.sides))
-        unknown = jnp.isnan(history.sides) | ~history.remembers
+        unknown = caused | ~history.remembers
         return jnp.where(unknown, 0, before), start, on_surface
+
+    def _was_true(self, history: History) -> Bool[Array, " resets"]:
+        """Return which Boolean conditions have become true, or are taken to be."""
+        return self.is_boolean & (jnp.isnan(history.sides) | (history.sides > 0))
 
     def _roots(
         self,
@@ -164,7 +191,11 @@ class EventSearch(NamedTuple):
         ends_there = step.t1 == _end_of_step(known, step.t0)
         near = jnp.where(ends_there, 4, 1) * tolerance
         is_same = (roots >= known - near) & (roots <= known + near) & jnp.isfinite(known)
-        return self.is_known | is_same
+        # Zeros without slope, and steps of Boolean conditions, have no time that could be moved to another.
+        is_sharp = ~self.is_boolean & (
+            tolerance <= 1e-9 * jnp.abs(step.length) + 32 * _rounding(step)
+        )
+        return self.is_known | (is_same & is_sharp)
 
     def _is_irregular(self, samples: SampledConditions, near: Array, touching: Array) -> Array:
         """Return which events have no derivative: more than one at a time, or zeros with almost no slope."""
@@ -214,7 +245,13 @@ class EventSearch(NamedTuple):
             jnp.where(is_told, step.t0, _after(step.t1)),
             jnp.where(jnp.arange(sides.size, dtype=number.dtype) == number, unknown, sides),
             jnp.zeros_like(sides),
+            jnp.zeros_like(sides),
         )
+
+
+def _rounding(step: SearchedStep) -> FloatScalar:
+    """Return the rounding of the times of a step."""
+    return jnp.finfo(step.t1.dtype).eps * jnp.maximum(jnp.abs(step.t0), jnp.abs(step.t1))
 
 
 def _first_sign(values: Float[Array, "samples resets"], small: Array) -> Float[Array, " resets"]:

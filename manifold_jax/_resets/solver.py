@@ -91,7 +91,7 @@ class Resetting(dfx.AbstractWrappedSolver):
         jumps = met.ends_step & ~met.exhausted
         happened = history.happened + (once & jumps).astype(jnp.int32)
         irregular = history.irregular + (jumps & met.irregular).astype(jnp.int32)
-        conditions = met.sides, met.scale
+        conditions = met.sides, met.scale, met.rates
         history = History(jumps, *conditions, happened, irregular, jumps & ~met.usable)
         result = update_result(result, met.result)
         report = Report(error, met._replace(memory=None, defined=1.0))
