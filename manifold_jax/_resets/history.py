@@ -28,7 +28,9 @@ class History(eqx.Module):
     def initial(count: int, dtype: Any) -> "History":
         never, zero = jnp.zeros(count, jnp.int32), jnp.zeros((), jnp.int32)
         unknown = jnp.zeros(count, dtype)
-        return History(jnp.asarray(True), *[unknown] * 3, never, zero, jnp.asarray(False))
+        return History(
+            jnp.asarray(True), unknown, unknown, unknown, never, zero, jnp.asarray(False)
+        )
 
     @property
     def remembers(self) -> Bool[Array, " resets"]:
