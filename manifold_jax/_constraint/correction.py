@@ -96,14 +96,15 @@ class CorrectionEquations(AbstractEquations):
         (d,) = pullback(z)
         return self.x + (d if self.inverse_metric is None else self.inverse_metric * d)
 
-    def point_after(
-        self, x: Float[Array, " n"], z: Float[Array, " m"], dz: Float[Array, " m"]
+    def place_after(
+        self, place: Float[Array, " n"], z: Float[Array, " m"], dz: Float[Array, " m"]
     ) -> Float[Array, " n"]:
-        """Return `x + V dz`. The terms of `V z` of light bodies may be larger by far than their sum: in
-        `V dz`, which becomes small, their rounding does, too."""
-        if self.directions is None:
-            return self.point(z + dz)
-        return x + combine(dz, self.directions)
+        """Return the displacement from `x`, increased by `V dz`. The terms of `V z` of light bodies may be larger by far
+        than their sum: in `V dz`, which becomes small, their rounding does, too."""
+        return place + combine(dz, self.directions)  # pyright: ignore[reportArgumentType]
+
+    def point_at(self, place: Float[Array, " n"]) -> Float[Array, " n"]:
+        return self.x + place
 
     def linearize(self, x: Float[Array, " n"]) -> FactoredGram:
         if isinstance(self.directions, AbstractRows):
@@ -227,13 +228,14 @@ def _solve(
         row_scale(G, equations.x, equations.redundant),
         jnp.zeros_like(r),
     )
+    still = jnp.zeros_like(equations.x)
     if far:
-        root = damped_newton(fixed, z, equations.x, r, scale, max_steps, tolerance)
+        root = damped_newton(fixed, z, still, r, scale, max_steps, tolerance)
     else:
-        root = chord(fixed, factored, z, equations.x, r, scale, max_steps)
+        root = chord(fixed, factored, z, still, r, scale, max_steps)
     full_rank = factorization.usable
     success = (root.scaled_residual <= tolerance) & full_rank
-    p = jnp.where(success, root.x, equations.x)
+    p = jnp.where(success, fixed.point_at(root.place), equations.x)
     return CorrectionRoot(p, root.z, root.iterations, root.scaled_residual, full_rank, success)
 
 

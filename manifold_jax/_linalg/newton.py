@@ -41,12 +41,17 @@ class AbstractEquations(eqx.Module):
     def linearize(self, x: Float[Array, " n"]) -> LinearizedAtPoint:
         """Return the derivative of the residual with respect to the unknowns, at a point."""
 
-    def point_after(
-        self, x: Float[Array, " n"], z: Float[Array, " m"], dz: Float[Array, " m"]
+    def place_after(
+        self, place: Float[Array, " n"], z: Float[Array, " m"], dz: Float[Array, " m"]
     ) -> Float[Array, " n"]:
-        """Return the point that belongs to `z + dz`, where `x` belongs to `z`."""
-        del x
+        """Return the place that belongs to `z + dz`, where `place` belongs to `z`. It is the point itself, or what the
+        point is found from."""
+        del place
         return self.point(z + dz)
+
+    def point_at(self, place: Float[Array, " n"]) -> Float[Array, " n"]:
+        """Return the point of a place."""
+        return place
 
 
 class SquareSystem(AbstractEquations):
@@ -65,10 +70,10 @@ class SquareSystem(AbstractEquations):
 
 
 class Iterate(NamedTuple):
-    """The unknowns, their point and residual, and the state of the iteration."""
+    """The unknowns, their place and residual, and the state of the iteration."""
 
     z: Float[Array, " m"]
-    x: Float[Array, " n"]
+    place: Float[Array, " n"]
     r: Float[Array, " m"]
     scaled_residual: FloatScalar  # max_i |r_i| / scale_i
     iterations: IntScalar
@@ -81,18 +86,20 @@ class _Search(NamedTuple):
     equations: AbstractEquations
     scale: Float[Array, " m"]
 
-    def after(self, z: Float[Array, " m"], x: Float[Array, " n"], dz: Float[Array, " m"]) -> tuple:
+    def after(
+        self, z: Float[Array, " m"], place: Float[Array, " n"], dz: Float[Array, " m"]
+    ) -> tuple:
         """Return the first four fields of the iterate at `z + dz`."""
-        x = self.equations.point_after(x, z, dz)
-        r = self.equations.residual(x)
-        return z + dz, x, r, self.scaled(r)
+        place = self.equations.place_after(place, z, dz)
+        r = self.equations.residual(self.equations.point_at(place))
+        return z + dz, place, r, self.scaled(r)
 
     def scaled(self, r: Float[Array, " m"]) -> FloatScalar:
         return jnp.max(jnp.abs(r) / self.scale, initial=0)
 
     def lowered(self, state: Iterate, dz: Float[Array, " m"]) -> Iterate:
         """Return the step to `z - dz` if it lowers the residual, else the state as it was."""
-        following = self.after(state.z, state.x, -dz)
+        following = self.after(state.z, state.place, -dz)
         progress = following[-1] < state.scaled_residual
         best = jtu.tree_map(lambda new, old: jnp.where(progress, new, old), following, state[:4])
         return Iterate(*best, state.iterations + 1, progress)  # pyright: ignore[reportCallIssue]
@@ -112,12 +119,12 @@ def chord(
     equations: AbstractEquations,
     linearization: LinearizedAtPoint,
     z: Float[Array, " m"],
-    x: Float[Array, " n"],
+    place: Float[Array, " n"],
     r: Float[Array, " m"],
     scale: Float[Array, " m"],
     max_steps: int,
 ) -> Iterate:
-    """Simplified Newton iteration from `z` at `x` with residual `r`, with a single factorization. Two
+    """Simplified Newton iteration from `z` at a place with residual `r`, with a single factorization. Two
     iterations are nearly always enough; for few equations they are written out, so that they fuse with
     the surrounding operations.
 
@@ -131,18 +138,20 @@ def chord(
     needed = scaled_residual > rounding
     for _ in range(written_out):
         dz = jnp.where(needed, -linearization.solve(r), 0)
-        z, x, r, scaled_residual = search.after(z, x, dz)
+        z, place, r, scaled_residual = search.after(z, place, dz)
     return jax.lax.while_loop(
         lambda s: (s.scaled_residual > rounding) & s.progress & (s.iterations < max_steps),
         lambda s: search.lowered(s, linearization.solve(s.r)),
-        Iterate(z, x, r, scaled_residual, jnp.asarray(written_out, jnp.int32), jnp.asarray(True)),
+        Iterate(
+            z, place, r, scaled_residual, jnp.asarray(written_out, jnp.int32), jnp.asarray(True)
+        ),
     )
 
 
 def damped_newton(
     equations: AbstractEquations,
     z: Float[Array, " m"],
-    x: Float[Array, " n"],
+    place: Float[Array, " n"],
     r: Float[Array, " m"],
     scale: Float[Array, " m"],
     max_steps: int,
@@ -160,11 +169,11 @@ def damped_newton(
 
     def advance(carry: tuple[Iterate, FloatScalar]) -> tuple[Iterate, FloatScalar]:
         s, damping = carry
-        dz = equations.linearize(s.x).solve(s.r)
+        dz = equations.linearize(equations.point_at(s.place)).solve(s.r)
         s = search.lowered(s, damping * dz)
         return s, jnp.where(s.progress, jnp.ones_like(damping), damping / 4)
 
-    start = Iterate(z, x, r, search.scaled(r), jnp.zeros((), jnp.int32), jnp.asarray(True))
+    start = Iterate(z, place, r, search.scaled(r), jnp.zeros((), jnp.int32), jnp.asarray(True))
     return jax.lax.while_loop(unfinished, advance, (start, jnp.ones_like(start.scaled_residual)))[0]
 
 
