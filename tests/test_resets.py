@@ -446,6 +446,20 @@ def test_order_of_events_at_one_time():
     assert sol.resets.times[0] == sol.resets.times[1]
 
 
+def grow(resets, **kwargs):
+    """Solve with `y[0] = exp(t)` up to rounding, and `y[1]` constant but for jumps."""
+    return mj.diffeqsolve(
+        dfx.ODETerm(lambda t, y, args: y * jnp.array([1.0, 0.0])),
+        dfx.Dopri8(),
+        0.0,
+        1.0,
+        0.02,
+        jnp.array([1.0, 0.0]),
+        resets=resets,
+        **kwargs,
+    )
+
+
 @pytest.mark.parametrize("time", [0.5, 0.7, 0.3000000000000001])
 def test_a_known_time_at_which_a_condition_crosses(time):
     """The first in `resets` comes first, here, too, and the event has no derivative."""
@@ -455,26 +469,14 @@ def test_a_known_time_at_which_a_condition_crosses(time):
     )
     known = mj.ResetAt([time], lambda t, y, args: y.at[1].set(10 * y[1] + 2))
     away = mj.ResetAt([time], lambda t, y, args: y.at[:].set(jnp.array([0.1, 7.0])))
-    field = dfx.ODETerm(lambda t, y, args: y * jnp.array([1.0, 0.0]))
-
-    def solve(*resets):
-        return mj.diffeqsolve(
-            field,
-            dfx.Dopri8(),
-            0.0,
-            1.0,
-            0.02,
-            jnp.array([1.0, 0.0]),
-            resets=resets,
-        )
 
     for resets, digits in ((known, crossing), 21), ((crossing, known), 12):
-        sol = solve(*resets)
+        sol = grow(resets)
         assert sol.ys[0, 1] == digits
         assert sol.resets.number == 2
         np.testing.assert_array_equal(sol.resets.times[:2], [time] * 2)
         assert sol.stats["num_nondifferentiable_resets"] > 0
-    sol = solve(away, crossing)  # from where the condition does not cross again
+    sol = grow((away, crossing))  # from where the condition does not cross again
     assert sol.ys[0, 1] == 7
     assert sol.resets.number == 1
 
@@ -486,22 +488,12 @@ def test_crossings_close_to_a_known_time(known_first, direction):
     a step ends that meets them."""
     offsets = jnp.array([-1e-7, -1e-10, -1e-13, 0.0, 1e-14, 1e-13, 1e-12, 1e-10, 1e-7])
     log = lambda k: lambda t, y, args: y.at[1].set(10 * y[1] + k)
-    field = dfx.ODETerm(lambda t, y, args: y * jnp.array([1.0, 0.0]))
 
     def solve(offset, boolean):
         at = jnp.exp(0.7) * (1 + offset)
         above = lambda t, y, args: y[0] >= at if boolean else y[0] - at
         resets = mj.Reset(above, log(1.0), direction=direction), mj.ResetAt([0.7], log(2.0))
-        return mj.diffeqsolve(
-            field,
-            dfx.Dopri8(),
-            0.0,
-            1.0,
-            0.02,
-            jnp.array([1.0, 0.0]),
-            resets=resets[::-1] if known_first else resets,
-            max_steps=200,
-        )
+        return grow(resets[::-1] if known_first else resets, max_steps=200)
 
     for boolean in (False, True):
         sols = jax.jit(jax.vmap(lambda c, boolean=boolean: solve(c, boolean)))(offsets)

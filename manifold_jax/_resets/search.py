@@ -1,7 +1,7 @@
 """The first event in a step, found by the signs of its conditions at samples of dense output."""
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -13,6 +13,13 @@ from .bracket import root_in_bracket
 from .history import History
 from .samples import BEYOND, SampledConditions, SearchedStep
 from .sensitivity import Sensitivity
+from .simultaneous import (
+    end_of_step,
+    is_same_time,
+    rounding_of_events,
+    rounding_of_times,
+    time_after,
+)
 
 
 class Found(NamedTuple):
@@ -78,37 +85,50 @@ class EventSearch(NamedTuple):
         roots = jnp.where(self.is_known, self.known_times, roots)
         roots = jnp.where(at_once, step.t0, roots)
         is_far = (roots > step.t1 + BEYOND * step.length) & ~at_once
-        rounding = _rounding(step)
-        at_end = roots >= self.end - 200 * rounding  # of the solve, where nothing happens any more
+        at_end = roots >= self.end - 200 * rounding_of_times(
+            step
+        )  # of the solve, where nothing happens any more
         roots = jnp.where(self.ignored | at_end | is_far, jnp.inf, roots)
-        tolerance = self._same_time(step, samples, noise, rounding)
-        is_at_known = self._is_at_known_time(step, roots, tolerance)
-        roots = jnp.where(is_at_known & ~self.is_known, jnp.min(self.known_times), roots)
+        tolerance = rounding_of_events(step, samples, noise, self.is_boolean)
+        next_known = jnp.min(self.known_times)
+        # Steps of Boolean conditions are not sharp enough to be moved to another time.
+        is_moved = is_same_time(step, roots, next_known, tolerance) & ~self.is_boolean
+        is_at_known = self.is_known | is_moved
+        roots = jnp.where(is_moved & ~self.is_known, next_known, roots)
         # At a known time the value is the one after the jump: a step that ends there is made again.
-        exactly = step.t1 == _end_of_step(roots, step.t0)
+        exactly = step.t1 == end_of_step(roots, step.t0)
         is_end = jnp.where(is_at_known, exactly, jnp.abs(roots - step.t1) <= tolerance)
         near = is_end & ~at_once
         irregular = self._is_irregular(samples, near & ~hops, at_once & on_surface)
-        # What jumps have caused already, or is at the same time, stays so until its own jump.
-        infinite = lambda sign: jnp.where(sign == 0, 0, sign * jnp.inf)
-        waiting = jnp.where(leaves, infinite(before), infinite(start))
+        come_from = signs[place, jnp.arange(place.size)]
+        waiting = jnp.where(leaves, _infinite(before), _infinite(start))
         same = self._was_true(history) | (jnp.isnan(history.sides) & (start == 0))
         waiting = jnp.where(same, history.sides, waiting)
-        # One that is zero to rounding there comes from where it was before.
-        is_zero = jnp.abs(samples.end) <= small
-        sides = jnp.where(is_zero, infinite(jnp.sign(samples.before_end)), samples.end)
-        sides = jnp.where(stays, infinite(start), sides)
-        sides = jnp.where(near, infinite(signs[place, jnp.arange(place.size)]), sides)
+        sides = jnp.where(stays, _infinite(start), _sides_at_end(samples, small))
+        # What jumps have caused already, or is at the same time, stays so until its own jump.
+        sides = jnp.where(near, _infinite(come_from), sides)
         sides = jnp.where(step.is_negative, waiting, sides)
-        # What a condition is at its event is zero, whatever is left of it there.
-        left_over = jnp.abs(samples.end) / (500 * jnp.finfo(noise.dtype).eps)
-        largest = jnp.where(near, jnp.maximum(largest, left_over), largest)
-        kept = jnp.where(step.is_negative | stays, history.scale, 0)
-        scale = jnp.maximum(largest, kept)
-        rates = (samples.end - samples.before_end) * self.parts / step.length
-        rates = jnp.where(step.is_negative | stays, history.rates, rates)
+        scale, rates = self._sizes(step, samples, history, near, stays)
         found = self._chosen(step, roots, near, at_once, irregular, sides)
         return found._replace(scale=jnp.where(found.ends_step | stays, scale, 0), rates=rates)
+
+    def _sizes(
+        self,
+        step: SearchedStep,
+        samples: SampledConditions,
+        history: History,
+        near: Array,
+        stays: Array,
+    ) -> tuple[Array, Array]:
+        """Return the largest values and the rates of change that are remembered after a step."""
+        largest = jnp.max(jnp.abs(samples.inside), axis=0)
+        # What a condition is at its event is zero, whatever is left of it there.
+        left_over = jnp.abs(samples.end) / (500 * jnp.finfo(largest.dtype).eps)
+        largest = jnp.where(near, jnp.maximum(largest, left_over), largest)
+        says_nothing = step.is_negative | stays
+        scale = jnp.maximum(largest, jnp.where(says_nothing, history.scale, 0))
+        rates = (samples.end - samples.before_end) * self.parts / step.length
+        return scale, jnp.where(says_nothing, history.rates, rates)
 
     def _crosses(self, before: Array, after: Array) -> Array:
         up, down = (before < 0) & (after >= 0), (before > 0) & (after <= 0)
@@ -134,7 +154,7 @@ class EventSearch(NamedTuple):
         on_surface = history.remembers & is_zero(samples.values[0])
         on_surface &= ~self.is_boolean & ~self.is_known
         # A Boolean condition may still be false where its event was taken to be.
-        late = 32 * _rounding(step) + 1e-10 * jnp.abs(step.length)
+        late = 32 * rounding_of_times(step) + 1e-10 * jnp.abs(step.length)
         soon = self.values(step.t0 + late, step.path(late / step.length))
         first = jnp.where(self._was_true(history), soon, samples.values[0])
         start = jnp.sign(jnp.where(on_surface, rate, first))
@@ -173,30 +193,6 @@ class EventSearch(NamedTuple):
         roots = root_in_bracket(value, (fractions[place], start), (right, end), found)
         return jnp.where(found, step.t0 + roots * step.length, jnp.inf)
 
-    def _same_time(
-        self, step: SearchedStep, samples: SampledConditions, noise: Array, rounding: Any
-    ) -> Float[Array, " resets"]:
-        """Return by how much rounding may move the events."""
-        rate = jnp.abs(samples.end - samples.before_end) * self.parts  # per step
-        noise = noise / jnp.maximum(rate, 1e3 * noise + jnp.finfo(rate.dtype).tiny)
-        noise = jnp.where(self.is_boolean, 1e-12, noise)
-        return 16 * rounding + jnp.abs(step.length) * noise
-
-    def _is_at_known_time(
-        self, step: SearchedStep, roots: Array, tolerance: Array
-    ) -> Bool[Array, " resets"]:
-        """Return which roots are the next known time, up to rounding if they are those of conditions."""
-        known = jnp.min(self.known_times)
-        # Stricter for other steps, so that none ends at the known time in vain, again and again.
-        ends_there = step.t1 == _end_of_step(known, step.t0)
-        near = jnp.where(ends_there, 4, 1) * tolerance
-        is_same = (roots >= known - near) & (roots <= known + near) & jnp.isfinite(known)
-        # Zeros without slope, and steps of Boolean conditions, have no time that could be moved to another.
-        is_sharp = ~self.is_boolean & (
-            tolerance <= 1e-9 * jnp.abs(step.length) + 32 * _rounding(step)
-        )
-        return self.is_known | (is_same & is_sharp)
-
     def _is_irregular(self, samples: SampledConditions, near: Array, touching: Array) -> Array:
         """Return which events have no derivative: more than one at a time, or zeros with almost no slope."""
         # That at the end of the parabola through three samples.
@@ -226,7 +222,7 @@ class EventSearch(NamedTuple):
         # Those at the same time are all that are at the end of the step, or all at its start.
         same = jnp.where(is_at_end, near, roots == earliest)
         number = jnp.argmax(same & happens).astype(jnp.int32)
-        target = _end_of_step(earliest, step.t0)
+        target = end_of_step(earliest, step.t0)
         at_start = EventAtStart(
             at_once[number], number, irregular[number], crosses=jnp.asarray(False)
         )
@@ -242,32 +238,25 @@ class EventSearch(NamedTuple):
             jnp.where(is_told, told.irregular, irregular[number]),
             number,
             target,
-            jnp.where(is_told, step.t0, _after(step.t1)),
+            jnp.where(is_told, step.t0, time_after(step.t1)),
             jnp.where(jnp.arange(sides.size, dtype=number.dtype) == number, unknown, sides),
             jnp.zeros_like(sides),
             jnp.zeros_like(sides),
         )
 
 
-def _rounding(step: SearchedStep) -> FloatScalar:
-    """Return the rounding of the times of a step."""
-    return jnp.finfo(step.t1.dtype).eps * jnp.maximum(jnp.abs(step.t0), jnp.abs(step.t1))
+def _infinite(sign: Array) -> Array:
+    """Return infinity of this sign: a side that is known, but no value."""
+    return jnp.where(sign == 0, 0, sign * jnp.inf)
+
+
+def _sides_at_end(samples: SampledConditions, small: Array) -> Float[Array, " resets"]:
+    """Return the values at the end; one that is zero to rounding there comes from where it was before."""
+    is_zero = jnp.abs(samples.end) <= small
+    return jnp.where(is_zero, _infinite(jnp.sign(samples.before_end)), samples.end)
 
 
 def _first_sign(values: Float[Array, "samples resets"], small: Array) -> Float[Array, " resets"]:
     """Return the sign of the first value of each condition that is larger than rounding, 0 without one."""
     signs = jnp.where(jnp.abs(values) > small[None, :], jnp.sign(values), 0)
     return signs[jnp.argmax(signs != 0, axis=0), jnp.arange(values.shape[1])]
-
-
-def _end_of_step(event: Array, t0: FloatScalar) -> Array:
-    """Return where a step from `t0` has to end for an event just after it."""
-    return jnp.maximum(_before(event), _after(t0))
-
-
-def _before(t: Array) -> Array:
-    return jnp.nextafter(t, jnp.asarray(-jnp.inf, t.dtype))
-
-
-def _after(t: FloatScalar) -> FloatScalar:
-    return jnp.nextafter(t, jnp.asarray(jnp.inf, t.dtype))
